@@ -15,7 +15,6 @@ have every trial exactly once, and the tables of the same sweep without Ray.
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import random
 import signal
@@ -29,13 +28,13 @@ os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_AUTH_MODE": "disabled", "JAX
 
 import ray
 from ray.cluster_utils import Cluster
+from reliability_pairs import of_sweep
 from timing import print_table
 
 from mjx_dher.system.machine import usable_cores
 
 ROOT = Path(__file__).resolve().parent.parent
 STORE = 80 << 20  # bytes of a node's object store
-TIMES = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")  # columns that differ between runs
 SIZES = """
     --preset cpu --env docs.examples.point_mass:PointMass --sampler future weighted --final-episodes 20 --num-envs 16
     --batch-size 64 --replay-size 4000 --hidden-sizes 32 --eval-episodes 20 --threshold 0.5 --checkpoint-every 2
@@ -93,17 +92,6 @@ def finished(process, seconds=1800):
         raise SystemExit(f"the command ended with status {process.returncode}: {process.args}")
 
 
-def table(folder, name):
-    """Rows of a table, without the columns that differ between runs."""
-    with (folder / name).open() as file:
-        return [{key: value for key, value in row.items() if key not in TIMES} for row in csv.DictReader(file)]
-
-
-def same_tables(one, other):
-    """Whether two sweeps have the same trials, once each, with the same curves and results."""
-    return all(table(one, name) == table(other, name) for name in ("results.csv", "finals.csv", "comparison.csv"))
-
-
 def kill(kind, nodes, driver, dice):
     """Kills a worker, a node or the driver. False if there was none to kill."""
     if kind == "worker":
@@ -151,7 +139,7 @@ def kills(rounds, seeds, seed, epochs=12):
                     f"{done - before}",
                     f"{starts}",
                     f"{len(trials)} of {2 * seeds}",
-                    "the same" if same_tables(reference, out) else "DIFFERENT",
+                    "the same" if of_sweep(reference) == of_sweep(out) else "DIFFERENT",
                     ", ".join(left) or "nothing",
                     f"{time.perf_counter() - started:.0f} s",
                 ]
@@ -179,7 +167,7 @@ def overhead(seconds):
             plain = timed(f"plain{number}", epochs)
             started = timed(f"empty{number}", 1, *on_ray)
             by_ray = timed(f"ray{number}", epochs, *on_ray)
-            same = same_tables(Path(folder) / f"plain{number}", Path(folder) / f"ray{number}")
+            same = of_sweep(Path(folder) / f"plain{number}") == of_sweep(Path(folder) / f"ray{number}")
             part = f"{by_ray / plain - 1:+.1%}"
             rows.append([f"{plain:.1f} s", f"{by_ray:.1f} s", part, f"{started:.1f} s", "the same" if same else "DIFFERENT"])
             print(*rows[-1], sep="; ", flush=True)

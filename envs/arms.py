@@ -21,8 +21,8 @@ import numpy as np
 
 from mjx_dher.context import euclidean
 from mjx_dher.envs.base import State
-from mjx_dher.envs.controls import Control
-from mjx_dher.envs.engines import Controls, Physics
+from mjx_dher.envs.controls import Actuators, Control
+from mjx_dher.envs.engines import Controls, Physics, variation_of
 from mjx_dher.envs.goals import Goal, Mark, Position
 from mjx_dher.envs.kinematics import Place
 from mjx_dher.envs.starts import Start
@@ -142,28 +142,20 @@ def mjcf(areas: dict[str, tuple[float, float, float]], cube: tuple[float, float]
 <keyframe><key name="home" qpos="{" ".join(map(str, qpos))}"/></keyframe></mujoco>"""
 
 
-class ArmTargets(Control):
+class ArmTargets(Actuators):
     """Targets of four joints, in the ranges of JaxGCRL; the other joints' targets are fixed."""
 
     size = 4
 
     def bind(self, model: mujoco.MjModel) -> Self:
         bound = copy.copy(self)
-        bound.moved = [f"joint{joint + 1}" for joint in _DRIVEN]
+        bound.moved, bound.indices = [f"joint{joint + 1}" for joint in _DRIVEN], list(_DRIVEN)
         bound.low, bound.high = _LOW, _HIGH
         return bound
 
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
-        targets = 0.5 * (_LOW + _HIGH) + 0.5 * (_HIGH - _LOW) * action
         fixed = controls.ctrl.at[:7].set(jnp.zeros(7, jnp.float32)).at[6].set(_WRIST)
-        return dataclasses.replace(controls, ctrl=fixed.at[np.array(_DRIVEN)].set(targets))
-
-    def rest(self, ctrl: Array) -> Array:
-        action = (ctrl[np.array(_DRIVEN)] - 0.5 * (_LOW + _HIGH)) / (0.5 * (_HIGH - _LOW))
-        return jnp.clip(action, -1.0, 1.0)
-
-    low: np.ndarray
-    high: np.ndarray
+        return super().apply(physics, action, dataclasses.replace(controls, ctrl=fixed))
 
 
 class OpenOrClosed(Control):
@@ -270,9 +262,11 @@ class ArmPushEasy(ArmReach):
         """The physics with the scaled sum of the servos' forces under the inputs `ctrl`, as a sensor."""
         model, joints = self.model, self.model.actuator_trnid[:, 0]
         qpos, qvel = physics.qpos[model.jnt_qposadr[joints]], physics.qvel[model.jnt_dofadr[joints]]
-        rows = model.actuator_gainprm[:, 0], *model.actuator_biasprm[:, 1:3].T, *model.actuator_forcerange.T
-        gain, stiffness, damping, low, high = np.array(rows, np.float32)
-        force = jnp.clip(gain * ctrl + stiffness * qpos + damping * qvel, low, high)
+        own = {} if physics.factors is None else variation_of(model, tuple(self._ranges)).values(physics.factors, jnp)
+        rows = (own.get(name, getattr(model, name).astype(np.float32)) for name in ("actuator_gainprm", "actuator_biasprm"))
+        gain, bias = (row.T for row in rows)
+        low, high = model.actuator_forcerange.T.astype(np.float32)
+        force = jnp.clip(gain[0] * ctrl + bias[1] * qpos + bias[2] * qvel, low, high)
         return dataclasses.replace(physics, sensors=self.scale * jnp.sum(force[self.forces], keepdims=True))
 
 

@@ -69,6 +69,10 @@ class SimulatedTask(GoalEnv):
         self._ranges = _ranges_of(self.varied if varied is None else varied)
         self._engine_options = engine_options
         self.engine = make_engine(engine, self.model, substeps, varied=tuple(self._ranges), **engine_options)
+        if self._ranges:
+            from mjx_dher.envs.engines.variation import check_friction
+
+            check_friction(self.model, self._ranges, self.engine.name)
         self._asked = plain(distance_threshold)
         if self._asked is not None:
             check_number("distance_threshold", self._asked, "(0, inf)", float)
@@ -155,8 +159,8 @@ class SimulatedTask(GoalEnv):
         If the simulation diverges or the action is not finite, the state returns to the start, and `failed` stays True until
         `reset`.
         """
-        action = jnp.clip(self.check_action(action), -1.0, 1.0)
-        physics = self.advance(state.physics, action)
+        action = self.check_action(action)
+        physics = self.advance(state.physics, jnp.clip(action, -1.0, 1.0))
         sound = self.is_sound(physics) & jnp.all(jnp.isfinite(action))  # MuJoCo C treats NaN inputs as 0
         physics = self._or_rest(physics, sound)
         failed = state.failed | ~sound

@@ -1,7 +1,6 @@
 """Actor and critic networks. The default `mlp` has four linear layers, as in the paper, with ReLU between them."""
 
 import functools
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -11,6 +10,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 
 from mjx_dher import components
+from mjx_dher.lookup import check_function
 from mjx_dher.types import Array, EnvSpec, PRNGKey, PyTree
 
 
@@ -256,13 +256,7 @@ def make(name: str | NetworksFn) -> NetworksFn:
 
 def check_heads(make_networks: NetworksFn, learner: str) -> None:
     """Raises ValueError if custom networks do not take `heads` as a fourth argument, which some learners need."""
-    try:
-        inspect.signature(make_networks).bind(*_PARAMETERS, "heads")
-    except TypeError:
-        raise ValueError(
-            f"networks must be a function ({', '.join(_PARAMETERS)}, heads) for learner {learner}, with the outputs that"
-            f" networks.Heads describes; got {make_networks!r}"
-        ) from None
+    check_function(f"networks for learner {learner} (see networks.Heads)", make_networks, (*_PARAMETERS, "heads"))
 
 
 def zeros(spec: EnvSpec, networks: Networks, *leading: int) -> tuple[PyTree, Array, Array]:

@@ -47,8 +47,8 @@ def test_twenty_four_trials_on_four_nodes_have_the_tables_of_one_program(bench, 
     with bench.Nodes(4) as nodes:
         bench.finished(bench.sweep(tmp_path / "fleet", *flags, "--ray", nodes.address, "--ray-chunk", 3))
         assert nodes.workers() == []
-    assert len(bench.table(tmp_path / "fleet", "finals.csv")) == 24
-    assert bench.same_tables(tmp_path / "plain", tmp_path / "fleet")
+    assert len(bench.of_sweep(tmp_path / "fleet")[1]) == 24  # finals.csv
+    assert bench.of_sweep(tmp_path / "plain") == bench.of_sweep(tmp_path / "fleet")
     assert "ray: 4 nodes, 4 parallel tasks, each with 0 GPUs and 1 CPUs; 24 runs" in (tmp_path / "fleet.log").read_text()
 
 
@@ -70,7 +70,7 @@ def test_without_a_storage_the_task_is_trained_again(bench, tmp_path):
         time.sleep(8)
         assert bench.kill("worker", nodes, driver, bench.random.Random(0))
         bench.finished(driver)
-    assert bench.same_tables(tmp_path / "plain", tmp_path / "fleet")
+    assert bench.of_sweep(tmp_path / "plain") == bench.of_sweep(tmp_path / "fleet")
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import numpy as np
 from mujoco import mjx
 
 from mjx_dher.envs.arm_kinematics import quat_multiply
+from mjx_dher.system import private_api
 from mjx_dher.types import Array
 
 
@@ -109,7 +110,7 @@ def implicit(fixed: mujoco.MjModel, alone: np.ndarray, model: mjx.Model, data: m
     """Computes `mjx.implicit` with the parts of MuJoCo C's implicitfast that it omits.
 
     An actuator at its force limit adds no damping. Damping that a control scales follows the clamped control. Gyroscopic
-    forces of free bodies on their own are implicit.
+    forces of free bodies on their own are implicit. Velocities of one branch do not act on another.
 
     Args:
       fixed: MuJoCo's form of the model.
@@ -136,7 +137,17 @@ def implicit(fixed: mujoco.MjModel, alone: np.ndarray, model: mjx.Model, data: m
         args = (blocks, damping, armature, frames, data.qvel[rows][:, 3:], force[rows])
         shifts = jax.vmap(functools.partial(gyroscopic, float(fixed.opt.timestep)))(*args)
         data = data.replace(qfrc_smooth=data.qfrc_smooth.at[rows].add(shifts))
-    return mjx.implicit(model, data)
+    with private_api.masked_velocity_derivative(_in_one_chain(fixed)):
+        return mjx.implicit(model, data)
+
+
+def _in_one_chain(model: mujoco.MjModel) -> np.ndarray:
+    """Whether one of two degrees of freedom [nv, nv] moves the other's body: the pairs that have inertia in MuJoCo C."""
+    above = np.eye(model.nv, dtype=np.float32)
+    for dof, parent in enumerate(model.dof_parentid):
+        if parent >= 0:
+            above[dof] += above[parent]
+    return above + above.T - np.eye(model.nv, dtype=np.float32)
 
 
 def gyroscopic(

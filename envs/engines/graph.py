@@ -35,7 +35,7 @@ def unsupported(model: mujoco.MjModel) -> list[str]:
             private_api.mujoco_warp().put_model(model)
     except NotImplementedError as error:
         left_out.append(str(error).rstrip("."))
-    return left_out
+    return left_out + pairs.too_slippery(model, "warp graph")
 
 
 def memory_for(model: mujoco.MjModel) -> tuple[int, int]:
@@ -162,7 +162,7 @@ class Simulation:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         self._step, self._model = warp.step, warp.put_model(model)
         self._last = warp.forward if sensors else None
-        # MuJoCo Warp takes the velocity term of equality constraints from the previous timestep.
+        # MuJoCo Warp takes the velocity term of equality constraints from the previous timestep, unless it is computed before.
         self._before = (warp.kinematics, warp.com_pos, warp.com_vel) if model.neq else ()
         self._model.opt.warn_overflow = 0  # printing kernels wait for the host
         self._varied = [self._own(name, np.asarray(getattr(model, name)), num_envs) for name in varied]
@@ -212,9 +212,9 @@ class Simulation:
         return lost
 
     def _run(self) -> None:
-        for compute in self._before:
-            compute(self._model, self._data)
         for _ in range(self._substeps):
+            for compute in self._before:
+                compute(self._model, self._data)
             self._step(self._model, self._data)
         if self._last:
             self._last(self._model, self._data)

@@ -34,7 +34,7 @@ _IGNORED = (
 
 
 def _ignored(model: mujoco.MjModel, sensors: bool) -> Iterator[str]:
-    """Features of a model, and of its sensors if they are read, that MJX 3.17 ignores without a clear error."""
+    """Features of a model, and of its sensors if they are read, that MJX 3.17 ignores or gets wrong without a clear error."""
     yield from beyond_defaults(model, _IGNORED.__contains__)
     if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER):
         yield "flags that disable springs or dampers"
@@ -47,6 +47,7 @@ def _ignored(model: mujoco.MjModel, sensors: bool) -> Iterator[str]:
     muscles = np.flatnonzero(model.actuator_gaintype == int(mujoco.mjtGain.mjGAIN_MUSCLE))
     if len(muscles) and model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
         yield with_names("damping of muscles with the integrator implicitfast", model, "actuator", muscles)
+    yield from pairs.too_slippery(model, "jax")
 
 
 def _is_in_one_chain(model: mujoco.MjModel, tendon: int) -> bool:
@@ -155,7 +156,8 @@ class MjxEngine:
         check_count("iterations", iterations)
         check_count("ls_iterations", ls_iterations)
         if ignored := [*_ignored(model, sensors)]:
-            raise ValueError(f"engine jax: MJX ignores features of the model: {', '.join(ignored)}; use engine native")
+            wrong = ", ".join(ignored)
+            raise ValueError(f"engine jax: MJX ignores features of the model, or gets them wrong: {wrong}; use engine native")
         self._variation = Variation(model, varied)
         model = with_stand_ins(model)
         _grow_for_margins(model)

@@ -5,11 +5,16 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from mjx_dher.envs.engines.features import with_names
+
 _TYPES = ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX", "MESH", "SDF")
 # Most contacts of two geoms, in the order of MuJoCo's types. Otherwise 1 with a sphere or an ellipsoid, else 8.
 _MOST = {("PLANE", "CAPSULE"): 2, ("PLANE", "CYLINDER"): 4, ("PLANE", "BOX"): 4, ("PLANE", "MESH"): 4}
 _MOST |= {("CAPSULE", "CAPSULE"): 2, ("CAPSULE", "BOX"): 2, ("CAPSULE", "CYLINDER"): 2}
 LEAST_FRICTION = 1e-5  # MuJoCo's
+# Lowest sliding friction of pyramidal and elliptic cones, by engine. A pyramid's stiffness grows as 1 / friction², which single
+# precision limits: below, resting objects move.
+LEAST_SLIDING = {"warp": (0.04, 0.0), "warp graph": (0.01, 0.0), "jax": (0.01, 0.001)}
 _MANY = 50  # contacts of height fields and signed distance fields
 
 
@@ -98,6 +103,16 @@ def mixed_friction(model: mujoco.MjModel, pairs: np.ndarray, friction: Any, xp: 
     counts = priority == priority.max(axis=1, keepdims=True)
     mixed = xp.where(counts[..., None], friction[pairs], -xp.inf).max(axis=1)
     return xp.maximum(mixed[:, np.array([0, 0, 1, 2, 2])], LEAST_FRICTION)
+
+
+def too_slippery(model: mujoco.MjModel, engine: str) -> list[str]:
+    """Contacts that slide too easily for an engine, with their geoms."""
+    pairs, elliptic = all_pairs(model), model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    least = LEAST_SLIDING.get(engine, (0.0, 0.0))[int(elliptic)]
+    low = (pairs.dim > 1) & (pairs.friction[:, 0] < 0.999 * least)  # rounding
+    geoms = np.unique(np.concatenate([pairs.geom1[low], pairs.geom2[low]]))
+    cone = "elliptic" if elliptic else "pyramidal"
+    return [with_names(f"sliding friction below {least:g} with the {cone} cone", model, "geom", geoms)] if len(geoms) else []
 
 
 def frictions(model: mujoco.MjModel, pairs: Pairs, friction: Any, xp: Any) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_dher.envs.engines.pairs import too_slippery
 from mjx_dher.envs.kinematics import names_of, pick
 from mjx_dher.lookup import check_name
 from mjx_dher.types import Array, PRNGKey
@@ -66,11 +67,12 @@ class Variation:
         # Field -> its numbers [n], and their change per unit of each factor [size, n].
         self._sums = {}
         if "body_mass" in self._fields:
-            slopes = [_constants(self._changed(model, row)) for row in np.eye(self.size)]
-            for field, nominal in _constants(self._changed(model, np.zeros(self.size))).items():
+            slopes = [_constants(self.changed(model, row)) for row in np.eye(self.size)]
+            for field, nominal in _constants(self.changed(model, np.zeros(self.size))).items():
                 self._sums[field] = nominal, np.stack([each[field] - nominal for each in slopes])
 
-    def _changed(self, model: mujoco.MjModel, more: np.ndarray) -> mujoco.MjModel:
+    def changed(self, model: mujoco.MjModel, more: np.ndarray) -> mujoco.MjModel:
+        """A model whose numbers are multiplied by the factors 1 + `more` [size]."""
         changed = copy.copy(model)
         for field, value in self.values(1 + more).items():
             getattr(changed, field)[...] = value
@@ -160,6 +162,13 @@ def to_ranges(varied: Mapping[str, Sequence[float]] | str) -> dict[str, tuple[fl
             raise ValueError(f"varied: {name!r} must be (low, high) with low <= high; got {given!r}")
         ranges[name] = (float(ends[0]), float(ends[1]))
     return ranges
+
+
+def check_friction(model: mujoco.MjModel, ranges: Mapping[str, tuple[float, float]], engine: str) -> None:
+    """Raises ValueError if the lowest friction of `ranges` is too low for an engine."""
+    lowest = Variation(model, list(ranges)).changed(model, np.array([low - 1 for low, _ in ranges.values()]))
+    for what in too_slippery(lowest, engine):
+        raise ValueError(f"varied: engine {engine} does not support {what}, which the lowest factors give; use engine native")
 
 
 def draw(ranges: Mapping[str, tuple[float, float]], key: PRNGKey) -> Array:

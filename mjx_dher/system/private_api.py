@@ -47,6 +47,29 @@ def bodies_computed_once() -> Iterator[None]:
         scan.body_tree = walk
 
 
+@contextlib.contextmanager
+def masked_velocity_derivative(mask: Any) -> Iterator[None]:
+    """Multiplies MJX's derivative of forces by velocities [nv, nv] by `mask`, while tracing `mjx.implicit`.
+
+    Private: `mujoco.mjx._src.derivative.deriv_smooth_vel`, which is replaced during the block, for every thread.
+    Why: MuJoCo C leaves out entries of two degrees of freedom of which neither moves the other, and MJX keeps them.
+    Needed by: mujoco-mjx 3.17.0. No upstream issue known.
+    """
+    from mujoco.mjx._src import derivative
+
+    full = derivative.deriv_smooth_vel
+
+    def masked(model, data):
+        derivatives = full(model, data)
+        return None if derivatives is None else derivatives * mask
+
+    derivative.deriv_smooth_vel = masked
+    try:
+        yield
+    finally:
+        derivative.deriv_smooth_vel = full
+
+
 def shift_reference_acceleration(data: Any, shift: Any) -> Any:
     """MJX `data` with `shift` [R] added to the reference acceleration of the first R constraint rows.
 

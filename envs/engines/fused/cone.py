@@ -6,7 +6,8 @@ mu N + T <= 0, and otherwise W / 2 (N - mu T)^2 / (1 + mu^2): https://mujoco.rea
 """
 
 from mjx_dher.envs.engines.fused.constraints import asked
-from mjx_dher.envs.engines.fused.model import Contacts, Dofs, Floats, Memory
+from mjx_dher.envs.engines.fused.dynamics import dot
+from mjx_dher.envs.engines.fused.model import Contacts, Dofs, Memory
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system.warp_setup import wp
 
@@ -20,7 +21,6 @@ def press_cones(dofs: Dofs, contacts: Contacts, memory: Memory, thread: int, thr
 
     A contact's first row has the contact's weight. The second row has mu in the weight's place.
     """
-    nv = dofs.number
     for at in range(thread, _MOST * memory.counts[0], threads):
         c, k = at // _MOST, at % _MOST
         s = memory.touching[c]
@@ -28,9 +28,7 @@ def press_cones(dofs: Dofs, contacts: Contacts, memory: Memory, thread: int, thr
         dim = contacts.dim[pair]
         if k < dim:
             row = memory.slot[c] + k
-            velocity = float(0.0)
-            for i in range(nv):
-                velocity += memory.jacobian[row * nv + i] * memory.qvel[i]
+            velocity = dot(memory.jacobian, row, memory.qvel, dofs.number)
             depth = memory.distance[s] - contacts.margin[pair]
             mu = contacts.mu[pair]
             asks = asked(contacts.soft[pair], depth, depth, contacts.weight[pair], 0.0)
@@ -42,14 +40,6 @@ def press_cones(dofs: Dofs, contacts: Contacts, memory: Memory, thread: int, thr
                 memory.weight[row] = mu
                 memory.residual[row] = -contacts.slip[pair] * velocity
     sync(threads)
-
-
-@wp.func
-def _times(memory: Memory, row: int, x: Floats, nv: int) -> float:
-    sum = float(0.0)
-    for i in range(nv):
-        sum += memory.jacobian[row * nv + i] * x[i]
-    return sum
 
 
 @wp.func
@@ -87,7 +77,7 @@ def begin_cones(memory: Memory, nv: int, thread: int, threads: int) -> float:
         size = float(0.0)
         for k in range(dim):
             asks = memory.residual[row + k]
-            has = _times(memory, row + k, memory.qacc, nv)
+            has = dot(memory.jacobian, row + k, memory.qacc, nv)
             memory.residual[row + k] = has - asks
             size += (wp.abs(has) + wp.abs(asks)) * (wp.abs(has) + wp.abs(asks))
         if _piece(memory.residual[row], _aside(memory, row, dim), _mu(memory, row, dim)) != _OPEN:
@@ -99,7 +89,7 @@ def begin_cones(memory: Memory, nv: int, thread: int, threads: int) -> float:
 def change_cones(memory: Memory, nv: int, thread: int, threads: int):
     """Computes how residuals change along the search direction."""
     for row in range(memory.counts[1] + thread, memory.counts[2], threads):
-        memory.change[row] = _times(memory, row, memory.search, nv)
+        memory.change[row] = dot(memory.jacobian, row, memory.search, nv)
     sync(threads)
 
 

@@ -5,7 +5,7 @@ A row asks for J qacc = aref, where aref = -k imp (r - margin) - b J qvel (- J' 
 """
 
 from mjx_dher.envs.engines.fused.contacts import tangent, tangent_of
-from mjx_dher.envs.engines.fused.dynamics import times
+from mjx_dher.envs.engines.fused.dynamics import dot, times
 from mjx_dher.envs.engines.fused.model import Bodies, Contacts, Dofs, Memory, Softness, World
 from mjx_dher.envs.engines.fused.threads import give_up, sync
 from mjx_dher.system.warp_setup import wp
@@ -272,15 +272,12 @@ def touch(
 @wp.func
 def press(dofs: Dofs, contacts: Contacts, memory: Memory, most: int, thread: int, threads: int):
     """Sets weights and reference accelerations of the contacts' rows, at most `most` rows per contact."""
-    nv = dofs.number
     for at in range(thread, most * memory.counts[0], threads):
         s = memory.touching[at // most]
         pair = contacts.pair[s]
         row = memory.slot[at // most] + at % most
         if at % most < contacts.edges[pair]:
             depth = memory.distance[s] - contacts.margin[pair]
-            velocity = float(0.0)
-            for i in range(nv):
-                velocity += memory.jacobian[row * nv + i] * memory.qvel[i]
+            velocity = dot(memory.jacobian, row, memory.qvel, dofs.number)
             _ask(memory, row, contacts.soft[pair], depth, depth, contacts.weight[pair], velocity)
     sync(threads)

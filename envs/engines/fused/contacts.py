@@ -30,7 +30,7 @@ def collide_with_planes(contacts: Contacts, memory: Memory, thread: int, threads
             pos1 = _pos(contacts, memory, geom1)
             pos2 = _pos(contacts, memory, geom2)
             margin = contacts.margin[p]
-            normal = wp.vec3(mat1[0, 2], mat1[1, 2], mat1[2, 2])
+            normal = axis_of(mat1)
             if wp.dot(pos2 - pos1, normal) <= contacts.geom_reach[geom2] + margin:
                 mat2 = _mat(contacts, memory, geom2)
                 size2 = contacts.geom_size[geom2]
@@ -56,9 +56,7 @@ def collide_boxes(contacts: Contacts, memory: Memory, thread: int, threads: int)
                 first = contacts.first[p]
                 number, distances, places, normal = _box_box(pos1, mat1, size1, pos2, mat2, size2, margin)
                 for i in range(number):
-                    memory.distance[first + i] = distances[i]
-                    memory.place[first + i] = places[i]
-                    memory.normal[first + i] = normal
+                    put(memory, first + i, distances[i], places[i], normal)
     sync(threads)
 
 
@@ -145,8 +143,7 @@ def tangent(normal: wp.vec3) -> wp.vec3:
 def tangent_of(contacts: Contacts, memory: Memory, pair: int, normal: wp.vec3) -> wp.vec3:
     """First tangent of a contact: of a plane and a capsule, as in MuJoCo C, along the capsule unless it stands."""
     if contacts.kind[pair] == kinds.PLANE_CAPSULE:
-        mat = _mat(contacts, memory, contacts.geom2[pair])
-        axis = wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2])
+        axis = axis_of(_mat(contacts, memory, contacts.geom2[pair]))
         along = axis - wp.dot(axis, normal) * normal
         if wp.length(along) > 1.0e-6:
             return wp.normalize(along)
@@ -171,6 +168,12 @@ def geom_of(contacts: Contacts, memory: Memory, geom: int):
 
 
 @wp.func
+def axis_of(mat: wp.mat33) -> wp.vec3:
+    """Third axis of a geom: a plane's normal, the direction of a capsule or cylinder."""
+    return wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2])
+
+
+@wp.func
 def put(memory: Memory, slot: int, distance: float, place: wp.vec3, normal: wp.vec3):
     """Sets a slot."""
     memory.distance[slot] = distance
@@ -189,20 +192,16 @@ def _corners(
         down = wp.dot(arm, normal)
         distance = wp.dot(pos - plane, normal) + down
         if distance < margin and down <= 0.0 and corners < 4:
-            memory.distance[first + corners] = distance
-            memory.place[first + corners] = pos + arm - 0.5 * distance * normal
-            memory.normal[first + corners] = normal
+            put(memory, first + corners, distance, pos + arm - 0.5 * distance * normal, normal)
             corners += 1
 
 
 @wp.func
 def _rim(memory: Memory, first: int, plane: wp.vec3, normal: wp.vec3, pos: wp.vec3, mat: wp.mat33, size: wp.vec3):
     """Sets the slots of a plane and a cylinder."""
-    distances, places, out = _plane_cylinder(normal, plane, pos, wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2]), size[0], size[1])
+    distances, places, out = _plane_cylinder(normal, plane, pos, axis_of(mat), size[0], size[1])
     for i in range(4):
-        memory.distance[first + i] = distances[i]
-        memory.place[first + i] = places[i]
-        memory.normal[first + i] = out
+        put(memory, first + i, distances[i], places[i], out)
 
 
 @wp.func

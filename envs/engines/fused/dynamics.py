@@ -12,6 +12,15 @@ from mjx_dher.system.warp_setup import wp
 
 
 @wp.func
+def dot(matrix: Floats, row: int, x: Floats, size: int) -> float:
+    """Row of a matrix [.., size] times a vector [size]."""
+    sum = float(0.0)
+    for i in range(size):
+        sum += matrix[row * size + i] * x[i]
+    return sum
+
+
+@wp.func
 def times(a: wp.vec4, b: wp.vec4) -> wp.vec4:
     """Product of two quaternions (w, x, y, z)."""
     return wp.vec4(

@@ -8,7 +8,7 @@ Source: D. Bertsekas, Projected Newton methods for optimization problems with si
 """
 
 from mjx_dher.envs.engines.fused import model as kinds
-from mjx_dher.envs.engines.fused.contacts import geom_of, put
+from mjx_dher.envs.engines.fused.contacts import axis_of, geom_of, put
 from mjx_dher.envs.engines.fused.model import Contacts, Memory
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system import private_api
@@ -33,8 +33,7 @@ def collide_ellipsoids(contacts: Contacts, memory: Memory, thread: int, threads:
             margin = contacts.margin[i]
             slot = contacts.first[i]
             if kind == kinds.PLANE_ELLIPSOID:
-                plane = wp.vec3(mat1[0, 2], mat1[1, 2], mat1[2, 2])
-                distance, place, normal = _plane_ellipsoid(plane, pos1, pos2, mat2, size2)
+                distance, place, normal = _plane_ellipsoid(axis_of(mat1), pos1, pos2, mat2, size2)
                 put(memory, slot, distance, place, normal)
             elif wp.length(pos2 - pos1) <= contacts.geom_reach[geom1] + contacts.geom_reach[geom2] + margin:
                 if kind == kinds.ELLIPSOID_BOX:

@@ -7,7 +7,7 @@ a polygon for the circle, so its two contacts are up to a twentieth of the radiu
 """
 
 from mjx_dher.envs.engines.fused import model as kinds
-from mjx_dher.envs.engines.fused.contacts import geom_of, put
+from mjx_dher.envs.engines.fused.contacts import axis_of, geom_of, put
 from mjx_dher.envs.engines.fused.model import Contacts, Memory
 from mjx_dher.envs.engines.fused.threads import sync
 from mjx_dher.system import private_api
@@ -33,7 +33,7 @@ def collide_round(contacts: Contacts, memory: Memory, thread: int, threads: int)
             margin = contacts.margin[p]
             apart = wp.length(pos2 - pos1) - contacts.geom_reach[geom1] - contacts.geom_reach[geom2]
             if kind == kinds.PLANE_SPHERE or kind == kinds.PLANE_CAPSULE:
-                apart = wp.dot(pos2 - pos1, _axis(mat1)) - contacts.geom_reach[geom2]
+                apart = wp.dot(pos2 - pos1, axis_of(mat1)) - contacts.geom_reach[geom2]
             if apart <= margin:
                 _meet(memory, kind, contacts.first[p], margin, pos1, mat1, size1, pos2, mat2, size2)
     sync(threads)
@@ -53,7 +53,7 @@ def _meet(
     size2: wp.vec3,
 ):
     """Sets the slots of a pair of geoms."""
-    axis1, axis2 = _axis(mat1), _axis(mat2)
+    axis1, axis2 = axis_of(mat1), axis_of(mat2)
     if kind == kinds.PLANE_SPHERE:
         distance, place = _plane_sphere(axis1, pos1, pos2, size2[0])
         put(memory, first, distance, place, axis1)
@@ -82,12 +82,6 @@ def _meet(
 
 
 @wp.func
-def _axis(mat: wp.mat33) -> wp.vec3:
-    """Third axis of a geom: a plane's normal, a capsule's direction."""
-    return wp.vec3(mat[0, 2], mat[1, 2], mat[2, 2])
-
-
-@wp.func
 def collide_cylinders_with_round(contacts: Contacts, memory: Memory, thread: int, threads: int):
     """Computes distance, place and normal of the slots of spheres and capsules with cylinders."""
     for i in range(thread, contacts.pairs, threads):
@@ -100,7 +94,7 @@ def collide_cylinders_with_round(contacts: Contacts, memory: Memory, thread: int
             if wp.length(pos2 - pos1) <= reach:
                 back = wp.transpose(mat2)
                 middle = back * (pos1 - pos2)
-                axis = back * wp.vec3(mat1[0, 2], mat1[1, 2], mat1[2, 2])
+                axis = back * axis_of(mat1)
                 at = float(0.0)
                 if kind == kinds.CAPSULE_CYLINDER:
                     low = _end(middle, axis, -size1[1], size1[1], -_FLAT, size2)

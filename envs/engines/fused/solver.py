@@ -7,7 +7,7 @@ Todorov, Convex and analytically-invertible dynamics with contacts and constrain
 
 from mjx_dher.envs.engines.fused import model as kinds
 from mjx_dher.envs.engines.fused.cone import add_cones, begin_cones, change_cones, slopes_cones, take_cones
-from mjx_dher.envs.engines.fused.dynamics import damping
+from mjx_dher.envs.engines.fused.dynamics import damping, dot
 from mjx_dher.envs.engines.fused.linear import direction
 from mjx_dher.envs.engines.fused.memory import copy
 from mjx_dher.envs.engines.fused.model import Bodies, Dofs, Floats, Memory, Sparse, World
@@ -25,15 +25,6 @@ _WHOLE = wp.constant(1e-3)  # how near to 1 a step counts as Newton's own
 def _pull(world: World, row: int, residual: float, weight: float) -> float:
     """Weight of a row if it acts, else 0. The first ones, of equalities, always do."""
     return wp.where(row < world.equalities or residual < 0.0, weight, 0.0)
-
-
-@wp.func
-def _dot(matrix: Floats, row: int, x: Floats, size: int) -> float:
-    """Row of a matrix [.., size] times a vector [size]."""
-    sum = float(0.0)
-    for i in range(size):
-        sum += matrix[row * size + i] * x[i]
-    return sum
 
 
 @wp.func
@@ -173,7 +164,7 @@ def _begin(
     unsure = float(0.0)
     for row in range(thread, rows, threads):
         asked = memory.residual[row]
-        has = _dot(memory.jacobian, row, memory.qacc, nv)
+        has = dot(memory.jacobian, row, memory.qacc, nv)
         residual = has - asked
         memory.residual[row] = residual
         size = wp.abs(has) + wp.abs(asked)
@@ -231,7 +222,7 @@ def solve(world: World, sparse: Sparse, memory: Memory, has_sparse: bool, ellipt
             curve += memory.search[i] * step_i
             memory.step[i] = step_i
         for row in range(thread, rows, threads):
-            memory.change[row] = _dot(memory.jacobian, row, memory.search, nv)
+            memory.change[row] = dot(memory.jacobian, row, memory.search, nv)
         if has_sparse:
             change_sparse(sparse, memory, thread, threads)
         if elliptic:

@@ -8,7 +8,7 @@ import numpy as np
 
 from mjx_dher.envs.engines.features import beyond_defaults, stand_alone, with_names
 from mjx_dher.envs.engines.fused import setup
-from mjx_dher.envs.engines.pairs import all_pairs, types_of
+from mjx_dher.envs.engines.pairs import all_pairs, too_slippery, types_of
 
 # Fields of MjModel that `setup` reads, with restrictions below.
 _READ = re.compile(
@@ -152,3 +152,4 @@ def _contact_restrictions(model: mujoco.MjModel) -> Iterator[str]:
             geoms.setdefault(what, {}).update(dict.fromkeys(ends))
     for what, these in geoms.items():
         yield with_names(what, model, "geom", these)
+    yield from too_slippery(model, "warp")
