@@ -253,6 +253,8 @@ class ArmPushEasy(ArmReach):
     def advance(self, physics: Physics, action: Array) -> Physics:
         return self._with_force(super().advance(physics, action), self.controls(physics, action).ctrl)
 
+    describe = MujocoTask.describe  # `layout` has what `observe` adds
+
     def observe(self, physics: Physics) -> Array:
         left, right = (place.position(physics.qpos) for place in self._tips)
         assert physics.sensors is not None

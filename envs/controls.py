@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import warnings
+from collections.abc import Sequence
 from typing import Any, Self
 
 import jax.numpy as jnp
@@ -27,11 +28,11 @@ class Control:
     """Base class: maps `size` numbers of an action, in [-1, 1], to inputs of an engine."""
 
     size: int
-    moved: list[str]  # names of the actuators or the mocap body
+    moved: Sequence[str] = ()  # names of the actuators or the mocap body
 
     def bind(self, model: mujoco.MjModel) -> Self:
         """Copy for `model`. Raises ValueError for a name that the model lacks."""
-        raise NotImplementedError
+        return copy.copy(self)
 
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:
         """Updates the engine's inputs for an action.
@@ -132,6 +133,11 @@ class JointDelta(JointPosition):
         bound.gear = slope * np.array(model.actuator_gear[bound.indices, 0], np.float32)
         if offset.any():
             bound.offset = offset
+        width = np.abs((bound.high - bound.low) / bound.gear)
+        for name, wide in zip(bound.moved, width.tolist()):
+            if self.scale > wide:
+                moves = f"control JointDelta moves {name} by {self.scale:g} per action, and its range is {wide:.3g} wide"
+                warnings.warn(f"{moves}: is the scale in degrees?", stacklevel=2)
         return bound
 
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:

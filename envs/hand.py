@@ -216,6 +216,7 @@ class HandReach(HandTask):
     goal = Fingertips()
     start = Start("start")
     observations = (*HandTask.observations, *(f"site:{name}" for name in TIPS))
+    describe = MujocoTask.describe  # `observe` keeps the layout
 
     def observe(self, physics: Physics) -> Array:
         return super().observe(physics).at[-self.goal_size :].set(self.achieved(physics))

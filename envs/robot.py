@@ -40,6 +40,10 @@ class RobotLoop:
             raise ValueError(f"env must be a task from an MJCF, or wrappers around one; got {type(task).__name__}")
         self.task, self.policy = task, policy
         trained, own = getattr(policy, "interface", None) or {}, json.loads(json.dumps(robot_interface(task)))
+        if trained and trained.get("own", []) != own.get("own", []):
+            raise ValueError(
+                f"env has its own {own.get('own', [])}, and the policy was trained with own {trained.get('own', [])}"
+            )
         for name in ("dt", "controls", "layout", "joints", "sensors"):
             if name in trained and not _agree(trained[name], own.get(name)):
                 raise ValueError(f"env has {name} {own.get(name)}, and the policy was trained with {trained[name]}")

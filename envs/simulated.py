@@ -79,6 +79,7 @@ class SimulatedTask(GoalEnv):
         self.bind()
         self.distance_threshold = plain(self.threshold) if self._asked is None else self._asked
         check_number("distance_threshold", self.distance_threshold, "(0, inf)", float)
+        self.check_own()
 
     @abc.abstractmethod
     def load(self) -> mujoco.MjModel:
@@ -103,6 +104,9 @@ class SimulatedTask(GoalEnv):
     @abc.abstractmethod
     def is_sound(self, physics: Physics) -> Array:
         """Whether this is a possible state of the task, bool []. NaN is not."""
+
+    def check_own(self) -> None:
+        """Checks methods that a subclass replaces, once sizes are known."""
 
     @property
     def spec(self) -> EnvSpec:

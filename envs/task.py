@@ -43,6 +43,21 @@ __all__ = [
 ]
 
 
+# Values that are no fields of a task, and what to set instead.
+_ELSEWHERE = {
+    **dict.fromkeys(("threshold", "distance_threshold"), "the goal's threshold"),
+    **dict.fromkeys(("observation_size", "layout"), "observations"),
+    **{"dt": "hz", "goal_size": "goal", "action_size": "control", "rest_action": "start"},
+}
+# Methods that an interface describes, with the entries that are left out if a subclass replaces a method and not `describe`.
+_DESCRIBED = {
+    "controls": ["controls"],
+    "advance": ["controls"],
+    "observe": ["layout", "joints", "sensors"],
+    "achieved": ["goal"],
+}
+
+
 class MujocoTask(SimulatedTask):
     """A goal-conditioned task from a model and a few declarations. You can override every method.
 
@@ -68,16 +83,23 @@ class MujocoTask(SimulatedTask):
         if not callable(self.controls):
             raise ValueError(f"controls is a method of a task; the field is control; got controls = {self.controls!r}")
         _check_names(type(self))
-        declared = self.control if isinstance(self.control, Sequence) else (self.control,)
+        declared = self.control if isinstance(self.control, (list, tuple)) else (self.control,)
         self.parts = [_checked("control", part, Control).bind(self.model) for part in declared]
+        for part in self.parts:
+            _check_has("control", part, Control, "size", "apply")
         self.action_size = sum(part.size for part in self.parts)
         moved = [name for part in self.parts for name in part.moved]
-        if len(set(moved)) < max(1, len(moved)):
+        if len(set(moved)) < len(moved) or not self.action_size:
             raise ValueError(f"control must move something, and nothing twice; got {moved}")
         goal = copy.copy(_checked("goal", getattr(self, "goal", None), Goal))
-        goal.threshold = goal.threshold if self._asked is None else self._asked
+        if self._asked is not None:
+            goal.threshold = self._asked
+        _check_has("goal", goal, Goal, "threshold", "achieved", "sample")
         self.goal = goal.bind(self.model)
-        self.goal_size, self.goal_distance, self.threshold = self.goal.size, self.goal.distance, self.goal.threshold
+        _check_has("goal", self.goal, Goal, "size", "distance")
+        self.goal_size, self.threshold = self.goal.size, self.goal.threshold
+        if not hasattr(type(self), "goal_distance"):
+            self.goal_distance = self.goal.distance
         self.start = _checked("start", self.start, Start).bind(self.model)
         self._rest, self._hold = self.start.physics, self.start.hold
         self.rest_action = np.asarray(self._rest_of(self._hold.ctrl))  # keeps the start
@@ -100,9 +122,37 @@ class MujocoTask(SimulatedTask):
         probes.check_overlaps(self.model, rest, self.start.drawn)
         probes.check_reachable(self.model, rest, self.goal)
 
+    def check_own(self) -> None:
+        if "observe" in self._own:
+            (self.observation_size,) = self._shape_of("observe")
+        if "achieved" in self._own and self._shape_of("achieved") != (self.goal_size,):
+            raise ValueError(f"achieved must return a goal [{self.goal_size}]; got shape {list(self._shape_of('achieved'))}")
+
+    @property
+    def _own(self) -> list[str]:
+        """Methods of `_DESCRIBED` that a subclass of the class with `describe` replaces."""
+        owner = lambda name: next(base for base in type(self).__mro__ if name in vars(base))  # noqa: E731
+        describes = owner("describe")
+        return [name for name in _DESCRIBED if owner(name) is not describes and issubclass(owner(name), describes)]
+
+    def _shape_of(self, method: str) -> tuple[int, ...]:
+        """Shape of what a method returns for the start."""
+        shape = jax.eval_shape(getattr(self, method), jax.tree.map(jnp.asarray, self._rest)).shape
+        if len(shape) != 1:
+            raise ValueError(f"{method} must return a vector; got shape {list(shape)}")
+        return shape
+
     @property
     def robot_interface(self) -> dict[str, Any]:
-        """Controls, goal, observation layout, and names of joints and sensors of its entries as JSON, for policy files."""
+        """Entries of `describe`, for policy files. Those that a subclass's methods may contradict are left out, and "own" has
+        these methods.
+        """
+        lost = {entry for name in self._own for entry in _DESCRIBED[name]}
+        kept = {name: value for name, value in self.describe().items() if name not in lost}
+        return kept | ({"own": self._own} if self._own else {})
+
+    def describe(self) -> dict[str, Any]:
+        """Controls, goal, observation layout, and names of joints and sensors of its entries, as JSON."""
         entries = list(zip(self.layout, self._entries))
         return {
             "controls": [part.describe() for part in self.parts],
@@ -230,10 +280,13 @@ def _folder(task: type) -> Path:
 
 
 def _check_names(task: type) -> None:
-    """Raises ValueError if a task class has a value under an argument's name, or under nearly a field's name."""
-    fields = [name for name in SimulatedTask.__annotations__ | MujocoTask.__annotations__ if name[0] != "_"]
+    """Raises ValueError if a task class has a value under an argument's or result's name, or under nearly a field's name."""
+    annotated = SimulatedTask.__annotations__ | MujocoTask.__annotations__
+    fields = [name for name in annotated if name[0] != "_" and name not in ("threshold", "goal_distance")]
     arguments = inspect.signature(SimulatedTask).parameters.keys() - fields
     for owner in task.__mro__[: task.__mro__.index(MujocoTask)]:
+        if elsewhere := sorted(vars(owner).keys() & _ELSEWHERE.keys()):
+            raise ValueError(f"{owner.__name__}.{elsewhere[0]} is no field of a task; set {_ELSEWHERE[elsewhere[0]]} instead")
         for name in vars(owner).keys() - fields - vars(MujocoTask).keys():
             near = hint(name, fields, cutoff=0.85)
             if name in arguments or (near and not callable(vars(owner)[name])):
@@ -246,3 +299,12 @@ def _checked(field: str, value: Any, kind: type) -> Any:
     if not isinstance(value, kind):
         raise ValueError(f"{field} must be a {kind.__name__} object; got {value!r}")
     return value
+
+
+def _check_has(field: str, value: Any, kind: type, *names: str) -> None:
+    """Raises ValueError if a control or goal lacks a name, or has only what the base class `kind` says of it."""
+    lacks = lambda name: not hasattr(value, name) or (hasattr(kind, name) and getattr(type(value), name) is getattr(kind, name))  # noqa: E731
+    if lacking := [name for name in names if lacks(name)]:
+        raise ValueError(
+            f"{field} {type(value).__name__} needs {' and '.join(lacking)}, as {kind.__module__}.{kind.__name__} says"
+        )

@@ -81,8 +81,7 @@ class Wrapper:
         """State after one step with an action [A], which is clipped to [-1, 1]."""
         if jnp.shape(action) != (self.env.action_size,):
             raise ValueError(f"action must be [{self.env.action_size}]; got shape {list(jnp.shape(action))}")
-        action = jnp.asarray(action, jnp.float32)
-        clipped = jnp.where(jnp.isfinite(action), jnp.clip(action, -1.0, 1.0), jnp.nan)  # so that the environment fails
+        clipped = jnp.where(jnp.isfinite(action), jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0), jnp.nan)  # which fails
         memory, action = self.act(state.memory, clipped)
         return self._seen(self.env.step(state.inner, action), memory)
 

@@ -48,7 +48,7 @@ def kept(method: str, before: PyTree, after: PyTree, leading: int = 0) -> None:
         for leaves in map(jax.tree_util.tree_leaves_with_path, (before, after))
     )
     names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
-    differing = [f"{name} is {old.get(name, 'absent')} and becomes {new.get(name, 'absent')}" for name in names]
+    differing = [f"{name or 'it'} is {old.get(name, 'absent')} and becomes {new.get(name, 'absent')}" for name in names]
     structure: Any = jax.tree.structure(before)
     if structure != jax.tree.structure(after) or differing:
         reason = (differing or ["its type or its static fields differ"])[0]

@@ -152,7 +152,9 @@ class Encoded(nn.Module):
 
 
 def with_encoder(networks: Networks) -> Networks:
-    """Networks whose actor and critic take observation trees, if there is an encoder."""
+    """Networks whose actor and critic take observation trees, if there is an encoder. Raises ValueError for another object."""
+    if not isinstance(networks, Networks):
+        raise ValueError(f"networks must return a mjx_dher.networks.Networks; got {networks!r}")
     if networks.encoder is None:
         return networks
     actor, critic = (Encoded(networks.encoder, network) for network in (networks.actor, networks.critic))

@@ -267,7 +267,7 @@ def test_a_start_that_diverged_fails_and_shows_the_rest():
         ({"max_speed": 0}, ("max_speed", 0)),
         ({"observation": ("qpos:a",)}, ("Declared.observation", "observations")),
         ({"episode_lenght": 30}, ("Declared.episode_lenght", "episode_length")),
-        ({"distance_threshold": 0.01}, ("Declared.distance_threshold", "argument", "threshold")),
+        ({"distance_threshold": 0.01}, ("Declared.distance_threshold", "set the goal's threshold")),
         ({"hz": 30}, ("hz", 30, "0.01")),
         ({"model": "no_such.xml"}, ("Declared", "no_such.xml")),
         ({"model": MACHINE.replace('armature="1"', "")}, ("unstable", "a")),

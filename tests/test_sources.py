@@ -57,7 +57,7 @@ def test_a_sweep_of_own_code_that_changed_trains_it_anew_and_says_so(own, tmp_pa
     own("# another reading")
     assert cli.main(command) == 0
     text = capsys.readouterr().out
-    assert "own_task.py (env own_task:Mine) has changed since 2 of the runs in" in text
+    assert "own_task.py or a file of its model (env own_task:Mine) has changed since 2 of the runs in" in text
     assert "own_task.py (metric own_task:near) has changed since 2 of the runs in" in text
     trials = tables.read(tmp_path / "sweep")
     assert len(trials) == 4
@@ -70,9 +70,9 @@ def test_eval_and_resume_say_which_file_changed_since(own, tmp_path, capsys):
     train(tmp_path / "run", spec, until=2)
     own("# another task")
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 0
-    assert "own_task.py has changed (env)" in capsys.readouterr().out
+    assert "own_task.py or a file of its model has changed (env)" in capsys.readouterr().out
     status, text = resume(tmp_path / "run", capsys)
-    assert (status, "own_task.py has changed (env)" in text) == (0, True), text
+    assert (status, "own_task.py or a file of its model has changed (env)" in text) == (0, True), text
     assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 0
     assert "has changed" not in capsys.readouterr().out
 

@@ -110,7 +110,7 @@ CheckArgs: Any = dataclasses.make_dataclass(
     [
         (field.name, _HINTS[field.name], dataclasses.field(default="reach" if field.name == "env" else field.default))
         for field in dataclasses.fields(RunSpec)
-        if field.name not in ("seed", "config", "hparams")
+        if field.name not in ("demonstrations", "seed", "config", "hparams")
     ],
     frozen=True,
 )

@@ -69,7 +69,7 @@ def changed_files(sweep: Path, specs: Sequence[RunSpec]) -> list[str]:
             continue  # reported when its result is read
         for (field, value), source in now.items():
             if content.get(field) == value and content["sources"].get(field) != source:
-                text = f"{source.split()[0]} ({field} {value}) has changed since"
+                text = f"{fingerprint.file_of(field, source)} ({field} {value}) has changed since"
                 told[text] = told.get(text, 0) + 1
     return [f"{text} {count} of the runs in {sweep}" for text, count in told.items()]
 

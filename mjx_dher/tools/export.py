@@ -53,7 +53,7 @@ def metadata(policy: Policy, run: RunSpec) -> dict[str, str]:
         "norm_clip": policy.norm_clip,
         "obs_clip": policy.obs_clip,
     }
-    names = ("dt", "controls", "goal", "layout", "joints", "sensors")
+    names = ("dt", "controls", "goal", "layout", "joints", "sensors", "own")
     about = {name: json.dumps(policy.interface[name]) for name in names if name in policy.interface}
     return {**about, **{name: str(value) for name, value in content.items()}}
 

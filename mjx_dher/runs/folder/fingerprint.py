@@ -193,7 +193,12 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, 
 
 def _changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> str:
     changed = [(name, before.get(name), now.get(name)) for name in {**before, **now} if before.get(name) != now.get(name)]
-    return "; ".join(f"{(new or old or '').split()[0]} has changed ({name})" for name, old, new in changed)
+    return "; ".join(f"{file_of(name, new or old or '')} has changed ({name})" for name, old, new in changed)
+
+
+def file_of(field: str, source: str) -> str:
+    """File of a component's source, and for an environment what else its digest covers."""
+    return source.split(maxsplit=1)[0] + (" or a file of its model" if field == "env" else "")
 
 
 def sha256_of(content: Any) -> str:
