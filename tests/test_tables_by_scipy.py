@@ -3,6 +3,7 @@
 import csv
 import itertools
 import math
+import re
 
 import numpy as np
 import pytest
@@ -179,3 +180,17 @@ def test_effects_of_what_helps(curves):
         gains = [best[task, "future", seed] - best[task, "uniform", seed] for seed in seeds]
         assert len(seeds) == 20
         assert cell.strip() == f"{np.mean(gains):+.3f}"
+
+
+def test_what_hindsight_gains():
+    """Of the table of runs with and without hindsight: means, and Student's interval of the paired difference."""
+    section = (ROOT / "docs" / "experiments" / "preset_gpu.md").read_text().split("## Without hindsight")[1].split("\n## ")[0]
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if re.match(r"\| \w*\s*\| \d", line)
+    ]
+    assert [row[1] for row in rows] == ["0", "16"] * 2
+    for without, with_hindsight in zip(rows[::2], rows[1::2]):
+        a, b = (np.array(row[2].split(", "), float) for row in (without, with_hindsight))
+        low, high = scipy.stats.t.interval(0.95, 4, (b - a).mean(), scipy.stats.sem(b - a))
+        assert [without[3], with_hindsight[3]] == [f"{a.mean():.3f}", f"{b.mean():.3f}"]
+        assert with_hindsight[4] == f"{(b - a).mean():.3f} ({low:.3f} to {high:.3f})"
