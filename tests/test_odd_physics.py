@@ -1,15 +1,21 @@
 """Physics that engines once got wrong in silence: tendons across branches, connects, slippery contacts, odd actions."""
 
+import re
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from conftest import refuses
+from mujoco import mjx
+from mujoco.mjx._src import derivative
 
 from mjx_dher import envs
 from mjx_dher.envs import Simulator
-from mjx_dher.envs.engines import Controls, Physics, make_engine
+from mjx_dher.envs.engines import Controls, Physics, corrections, make_engine
 
 # Two sliders that a tendon damps, and on the first a third one, which another tendon damps with its parent.
 BRANCHES = """
@@ -46,6 +52,43 @@ def test_a_tendon_damps_across_branches_as_in_mujoco_c(damping, actuator):
     np.testing.assert_allclose(played("jax", model, start, 1), played("native", model, start, 1), atol=1e-5)
 
 
+SLIDES = """<body pos="0.3 0.2 0.1"><joint name="a" type="slide" axis="1 0 0"/><joint name="b" type="slide" axis="0 1 0"/>{}
+<geom size="0.1" mass="1" contype="0"/><site name="s" pos="0.05 0.3 0.1"/></body>"""
+COUPLED = """
+<mujoco><option timestep="0.01" integrator="implicitfast" gravity="0 0 0"/><worldbody>
+<site name="w" pos="0.3 0.1 1"/>{body}</worldbody>
+<tendon><spatial damping="50"><site site="w"/><site site="s"/></spatial></tendon></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("body", "common"),
+    [
+        (SLIDES.format(""), 2),  # diagonal
+        (SLIDES.format('<body pos="0 0 1"><joint axis="0 1 0"/><geom size="0.1" mass="1" contype="0"/></body>'), 9),
+        (re.sub("<joint.*/>", "<freejoint/>", SLIDES).format(""), 36),
+        (re.sub("<joint.*/>", '<joint type="ball"/>', SLIDES).format(""), 3),
+        (re.sub("<joint.*/>", '<joint type="ball"/>', SLIDES).format("").replace("<geom", '<geom pos="0.1 0.05 0"'), 9),
+    ],
+)
+def test_a_damped_tendon_couples_the_joints_of_one_body_as_in_mujoco_c(body, common):
+    model = mujoco.MjModel.from_xml_string(COUPLED.format(body=body))
+    assert corrections._in_common(model).sum() == common
+    start = np.resize([1.0, 0.5, -0.3], model.nv) * (np.arange(model.nv) < 3)
+    np.testing.assert_allclose(played("jax", model, start, 1), played("native", model, start, 1), atol=1e-5)
+
+
+def test_programs_that_are_traced_at_once_have_their_own_derivatives(monkeypatch):
+    chain = re.sub(r"</body>\n(<body pos=\"0 1 0\">.*)</body></worldbody>", r"\1</body></body></worldbody>", BRANCHES)
+    models = [mujoco.MjModel.from_xml_string(xml.format(damping=' damping="50"', actuator="")) for xml in (BRANCHES, chain)]
+    both, implicit, before = threading.Barrier(2), mjx.implicit, derivative.deriv_smooth_vel
+    monkeypatch.setattr(mjx, "implicit", lambda *args: both.wait(60) >= 0 and implicit(*args))
+    with ThreadPoolExecutor(2) as pool:
+        parts = list(pool.map(lambda model: played("jax", model, [1.0, 0.5, 0.0], 1), models))
+    for model, part in zip(models, parts):
+        np.testing.assert_allclose(part, played("native", model, [1.0, 0.5, 0.0], 1), atol=1e-5)
+    assert derivative.deriv_smooth_vel is before
+
+
 def test_a_connect_has_the_speed_of_its_own_timestep():
     pytest.importorskip("warp")
     model = mujoco.MjModel.from_xml_string(CONNECT)
@@ -74,10 +117,30 @@ def test_contacts_that_slide_too_easily_are_refused(engine, path, cone, friction
         make_engine(engine, mujoco.MjModel.from_xml_string(BALL.format(cone, friction, 1)), 1, **options)  # has no friction
 
 
+@pytest.mark.parametrize("impratio", [100.0, 0.25])
+def test_a_pyramid_is_as_steep_as_friction_over_the_root_of_impratio(impratio):
+    least, steep = 0.01 * np.sqrt(impratio), BALL.replace('cone="{}"', f'cone="{{}}" impratio="{impratio}"')
+    with refuses(f"sliding friction below {least:g} with the pyramidal cone and impratio {impratio:g}", "ball"):
+        make_engine("jax", mujoco.MjModel.from_xml_string(steep.format("pyramidal", 0.9 * least, 3)), 1)
+    make_engine("jax", mujoco.MjModel.from_xml_string(steep.format("pyramidal", least, 3)), 1)
+    with refuses("sliding friction below 0.001 with the elliptic cone "):
+        make_engine("jax", mujoco.MjModel.from_xml_string(steep.format("elliptic", 0.0009, 3)), 1)
+
+
+def test_rounding_of_friction_and_contacts_without_forces_are_not_refused():
+    for friction, flag in ((0.00999999, ""), (0.0, '<flag constraint="disable"/>')):
+        xml = BALL.format("pyramidal", friction, 3).replace('"/><world', f'">{flag}</option><world')
+        make_engine("jax", mujoco.MjModel.from_xml_string(xml), 1)
+
+
 def test_varied_friction_stays_where_an_engine_computes_it():
     with refuses("varied", "engine jax", "sliding friction below 0.01", "object", "native"):
         envs.make("slide", engine="jax", varied="friction:object=0.05-1")
     envs.make("slide", engine="jax", varied="friction:object=0.1-1")
+    pytest.importorskip("warp")
+    for lowest, cure in ((0.3, '; use path="graph" or engine native'), (0.05, "; use engine native")):
+        with refuses("engine warp does", "friction below 0.04", cure):
+            envs.make("slide", engine="warp", allow_cpu=True, varied={"friction:object": (lowest, 1)})
     envs.make("slide", engine="native", varied="friction:object=0.05-1")
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from mujoco import mjx
+from mujoco.mjx._src import derivative
 
 from mjx_dher.system import private_api
 from mjx_dher.system.warp_setup import wp
@@ -110,6 +111,16 @@ def test_mjx_still_drops_the_velocity_term_of_a_weld():
     shifted = private_api.shift_reference_acceleration(d, -difference)
     np.testing.assert_allclose(shifted._impl.efc_aref[:6], data.efc_aref[:6], rtol=1e-5)
     np.testing.assert_array_equal(shifted._impl.efc_aref[6:], d._impl.efc_aref[6:])
+
+
+def test_mjx_still_couples_branches_by_a_damped_tendon():
+    body = '<body><joint name="{0}" type="slide"/><geom size=".1"/></body>'
+    tendon = '<tendon><fixed damping="5"><joint joint="a" coef="1"/><joint joint="b" coef="1"/></fixed></tendon>'
+    xml = f"<mujoco><worldbody>{body.format('a')}{body.format('b')}</worldbody>{tendon}</mujoco>"
+    model = mjx.put_model(mujoco.MjModel.from_xml_string(xml), impl="jax")
+    full = derivative.deriv_smooth_vel(model, mjx.forward(model, mjx.make_data(model, impl="jax")))
+    what = "MJX leaves out derivatives between branches"
+    assert full[0, 1] == -5.0, no_longer_needed(what, "mask_of_velocity_derivative, and engines.corrections._in_common")
 
 
 def test_mjx_still_brings_a_mujoco_warp_of_its_own():

@@ -13,6 +13,8 @@ from mjx_dher.envs.arm_kinematics import quat_multiply
 from mjx_dher.system import private_api
 from mjx_dher.types import Array
 
+_MASK = private_api.mask_of_velocity_derivative()  # here, because only one thread can import this module
+
 
 class _Frame:
     """A frame on a body, and the degrees of freedom that move it."""
@@ -110,7 +112,7 @@ def implicit(fixed: mujoco.MjModel, alone: np.ndarray, model: mjx.Model, data: m
     """Computes `mjx.implicit` with the parts of MuJoCo C's implicitfast that it omits.
 
     An actuator at its force limit adds no damping. Damping that a control scales follows the clamped control. Gyroscopic
-    forces of free bodies on their own are implicit. Velocities of one branch do not act on another.
+    forces of free bodies on their own are implicit. Velocities act only on degrees of freedom with common inertia.
 
     Args:
       fixed: MuJoCo's form of the model.
@@ -137,17 +139,25 @@ def implicit(fixed: mujoco.MjModel, alone: np.ndarray, model: mjx.Model, data: m
         args = (blocks, damping, armature, frames, data.qvel[rows][:, 3:], force[rows])
         shifts = jax.vmap(functools.partial(gyroscopic, float(fixed.opt.timestep)))(*args)
         data = data.replace(qfrc_smooth=data.qfrc_smooth.at[rows].add(shifts))
-    with private_api.masked_velocity_derivative(_in_one_chain(fixed)):
+    token = _MASK.set(_in_common(fixed))
+    try:
         return mjx.implicit(model, data)
+    finally:
+        _MASK.reset(token)
 
 
-def _in_one_chain(model: mujoco.MjModel) -> np.ndarray:
-    """Whether one of two degrees of freedom [nv, nv] moves the other's body: the pairs that have inertia in MuJoCo C."""
-    above = np.eye(model.nv, dtype=np.float32)
-    for dof, parent in enumerate(model.dof_parentid):
-        if parent >= 0:
-            above[dof] += above[parent]
-    return above + above.T - np.eye(model.nv, dtype=np.float32)
+def _in_common(model: mujoco.MjModel) -> np.ndarray:
+    """Pairs of degrees of freedom [nv, nv] that have common inertia in MuJoCo C: 1, else 0.
+
+    One of them moves the other's body, and they are not two slides or hinges of a body whose inertia is diagonal. Those of a
+    free joint count as well.
+    """
+    rows = np.repeat(np.arange(model.nv), model.M_rownnz)
+    common = np.zeros((model.nv, model.nv), np.float32)
+    common[rows, model.M_colind] = common[model.M_colind, rows] = 1
+    for start in model.jnt_dofadr[model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)]:
+        common[start : start + 6, start : start + 6] = 1
+    return common
 
 
 def gyroscopic(

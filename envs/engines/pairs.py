@@ -12,8 +12,8 @@ _TYPES = ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX"
 _MOST = {("PLANE", "CAPSULE"): 2, ("PLANE", "CYLINDER"): 4, ("PLANE", "BOX"): 4, ("PLANE", "MESH"): 4}
 _MOST |= {("CAPSULE", "CAPSULE"): 2, ("CAPSULE", "BOX"): 2, ("CAPSULE", "CYLINDER"): 2}
 LEAST_FRICTION = 1e-5  # MuJoCo's
-# Lowest sliding friction of pyramidal and elliptic cones, by engine. A pyramid's stiffness grows as 1 / friction², which single
-# precision limits: below, resting objects move.
+# Lowest sliding friction of pyramidal (with impratio 1) and elliptic cones, by engine. A pyramid's stiffness grows as
+# 1 / friction², which single precision limits: below, resting objects move.
 LEAST_SLIDING = {"warp": (0.04, 0.0), "warp graph": (0.01, 0.0), "jax": (0.01, 0.001)}
 _MANY = 50  # contacts of height fields and signed distance fields
 
@@ -108,11 +108,14 @@ def mixed_friction(model: mujoco.MjModel, pairs: np.ndarray, friction: Any, xp: 
 def too_slippery(model: mujoco.MjModel, engine: str) -> list[str]:
     """Contacts that slide too easily for an engine, with their geoms."""
     pairs, elliptic = all_pairs(model), model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-    least = LEAST_SLIDING.get(engine, (0.0, 0.0))[int(elliptic)]
+    least, cone = LEAST_SLIDING.get(engine, (0.0, 0.0))[int(elliptic)], "elliptic cone" if elliptic else "pyramidal cone"
+    if not elliptic and model.opt.impratio != 1:  # a pyramid is as steep as friction / sqrt(impratio)
+        least, cone = least * np.sqrt(model.opt.impratio), f"{cone} and impratio {model.opt.impratio:g}"
     low = (pairs.dim > 1) & (pairs.friction[:, 0] < 0.999 * least)  # rounding
+    if not low.any() or model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
+        return []
     geoms = np.unique(np.concatenate([pairs.geom1[low], pairs.geom2[low]]))
-    cone = "elliptic" if elliptic else "pyramidal"
-    return [with_names(f"sliding friction below {least:g} with the {cone} cone", model, "geom", geoms)] if len(geoms) else []
+    return [with_names(f"sliding friction below {least:g} with the {cone}", model, "geom", geoms)]
 
 
 def frictions(model: mujoco.MjModel, pairs: Pairs, friction: Any, xp: Any) -> dict[str, Any]:

@@ -168,7 +168,9 @@ def check_friction(model: mujoco.MjModel, ranges: Mapping[str, tuple[float, floa
     """Raises ValueError if the lowest friction of `ranges` is too low for an engine."""
     lowest = Variation(model, list(ranges)).changed(model, np.array([low - 1 for low, _ in ranges.values()]))
     for what in too_slippery(lowest, engine):
-        raise ValueError(f"varied: engine {engine} does not support {what}, which the lowest factors give; use engine native")
+        cure = 'path="graph" or ' if engine == "warp" and not too_slippery(lowest, "warp graph") else ""
+        told = f"engine {engine} does not support {what}, which the lowest factors give"
+        raise ValueError(f"varied: {told}; use {cure}engine native")
 
 
 def draw(ranges: Mapping[str, tuple[float, float]], key: PRNGKey) -> Array:

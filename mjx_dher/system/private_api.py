@@ -11,6 +11,7 @@ Two uses of internals stay where they are, because they are not Python names:
 """
 
 import contextlib
+import contextvars
 import functools
 import importlib
 import io
@@ -47,27 +48,23 @@ def bodies_computed_once() -> Iterator[None]:
         scan.body_tree = walk
 
 
-@contextlib.contextmanager
-def masked_velocity_derivative(mask: Any) -> Iterator[None]:
-    """Multiplies MJX's derivative of forces by velocities [nv, nv] by `mask`, while tracing `mjx.implicit`.
+def mask_of_velocity_derivative() -> contextvars.ContextVar[Any]:
+    """Makes MJX multiply its derivative of forces by velocities [nv, nv] by the value of the returned variable, if it has one.
 
-    Private: `mujoco.mjx._src.derivative.deriv_smooth_vel`, which is replaced during the block, for every thread.
-    Why: MuJoCo C leaves out entries of two degrees of freedom of which neither moves the other, and MJX keeps them.
+    Private: `mujoco.mjx._src.derivative.deriv_smooth_vel`, which is replaced for good. Each thread has its own value.
+    Why: MuJoCo C leaves out entries of two degrees of freedom without common inertia, and MJX keeps them.
     Needed by: mujoco-mjx 3.17.0. No upstream issue known.
     """
     from mujoco.mjx._src import derivative
 
-    full = derivative.deriv_smooth_vel
+    full, mask = derivative.deriv_smooth_vel, contextvars.ContextVar[Any]("mask", default=None)
 
     def masked(model, data):
         derivatives = full(model, data)
-        return None if derivatives is None else derivatives * mask
+        return derivatives if derivatives is None or mask.get() is None else derivatives * mask.get()
 
     derivative.deriv_smooth_vel = masked
-    try:
-        yield
-    finally:
-        derivative.deriv_smooth_vel = full
+    return mask
 
 
 def shift_reference_acceleration(data: Any, shift: Any) -> Any:
