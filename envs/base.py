@@ -56,7 +56,7 @@ class GoalEnv(abc.ABC):
 
     def check_action(self, action: Array) -> Array:
         """Converts `action` to float32. Raises ValueError for a wrong shape or, outside `jit`, for infinite or NaN values."""
-        shape = jnp.shape(action)
+        shape = np.shape(action)  # of a list, too
         if shape != (self.action_size,):
             raise ValueError(
                 f"action has shape {shape}; {self.name} takes ({self.action_size},)"

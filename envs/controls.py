@@ -12,7 +12,7 @@ import numpy as np
 
 from mjx_dher.envs.arm_kinematics import quat_multiply, quat_to_matrix
 from mjx_dher.envs.engines import Controls, Physics
-from mjx_dher.envs.kinematics import Numbered, Place, names_of, pick, rounded, to_quat
+from mjx_dher.envs.kinematics import HINGE, Numbered, Place, names_of, pick, rounded, to_quat
 from mjx_dher.lookup import check_name
 from mjx_dher.types import Array
 from mjx_dher.validation import check_number
@@ -133,11 +133,10 @@ class JointDelta(JointPosition):
         bound.gear = slope * np.array(model.actuator_gear[bound.indices, 0], np.float32)
         if offset.any():
             bound.offset = offset
-        width = np.abs((bound.high - bound.low) / bound.gear)
-        for name, wide in zip(bound.moved, width.tolist()):
-            if self.scale > wide:
-                moves = f"control JointDelta moves {name} by {self.scale:g} per action, and its range is {wide:.3g} wide"
-                warnings.warn(f"{moves}: is the scale in degrees?", stacklevel=2)
+        for i, name, gear, width in zip(bound.indices, bound.moved, np.abs(bound.gear), bound.high - bound.low):
+            if model.jnt_type[_joint(model, i)] == HINGE and self.scale * gear > 1.001 * width:  # else rounding
+                moves = f"control JointDelta moves {name} by {self.scale:g} per action"
+                warnings.warn(f"{moves}, and its range is {width / gear:.3g} wide: is the scale in degrees?", stacklevel=2)
         return bound
 
     def apply(self, physics: Physics, action: Array, controls: Controls) -> Controls:

@@ -113,8 +113,7 @@ class FetchEnv(SimulatedTask):
         """Lowest and highest coordinates [2, 3] of goals in m."""
         return self.task.goal_bounds.astype(np.float32)
 
-    @property
-    def robot_interface(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         entries = _WITH_OBJECT if self.has_object else _WITHOUT_OBJECT
         ends = np.cumsum([0, *entries.values()]).tolist()
         fingers = {"kind": "JointDelta", "moves": ["finger_r", "finger_l"] if self.drives_fingers else [], "scale": 1.0}

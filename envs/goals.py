@@ -33,7 +33,8 @@ class Goal:
 
     def bind(self, model: mujoco.MjModel) -> Self:
         """Copy for `model`. Raises ValueError for a name that the model lacks, or invalid bounds."""
-        check_number("threshold of the goal", self.threshold, "(0, inf)", float)
+        if hasattr(self, "threshold"):  # else a subclass sets it later
+            check_number("threshold of the goal", self.threshold, "(0, inf)", float)
         return copy.copy(self)
 
     def achieved(self, physics: Physics) -> Array:

@@ -228,6 +228,7 @@ class ManipulateTask(HandTask):
     episode_length = 100
     observations = (*HandTask.observations, "qvel:object", "qpos:object")
     goal: ObjectPose
+    describe = MujocoTask.describe  # `reached` keeps the goal
 
     def start_physics(self, key: PRNGKey) -> Physics:
         """Drops the object into the hand, and again if it falls out."""

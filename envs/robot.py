@@ -40,15 +40,14 @@ class RobotLoop:
             raise ValueError(f"env must be a task from an MJCF, or wrappers around one; got {type(task).__name__}")
         self.task, self.policy = task, policy
         trained, own = getattr(policy, "interface", None) or {}, json.loads(json.dumps(robot_interface(task)))
-        if trained and trained.get("own", []) != own.get("own", []):
-            raise ValueError(
-                f"env has its own {own.get('own', [])}, and the policy was trained with own {trained.get('own', [])}"
-            )
+        if "own" in trained and trained["own"] != own.get("own", []):  # policies of older versions lack it
+            raise ValueError(f"env has its own {own.get('own', [])}, and the policy was trained with own {trained['own']}")
+        described = trained.keys() & own.keys()  # env leaves out what its own methods may contradict
         for name in ("dt", "controls", "layout", "joints", "sensors"):
-            if name in trained and not _agree(trained[name], own.get(name)):
-                raise ValueError(f"env has {name} {own.get(name)}, and the policy was trained with {trained[name]}")
+            if name in described and not _agree(trained[name], own[name]):
+                raise ValueError(f"env has {name} {own[name]}, and the policy was trained with {trained[name]}")
         goals = [{name: each.get("goal", {}).get(name) for name in ("kind", "of")} for each in (trained, own)]
-        if "goal" in trained and goals[0] != goals[1]:
+        if "goal" in described and goals[0] != goals[1]:
             raise ValueError(f"env has the goal {goals[1]}, and the policy was trained with {goals[0]}")
         model, sensors = task.model, task._rest.sensors
         self._sizes = {"qpos": model.nq, "qvel": model.nv, "goal": task.goal_size}

@@ -17,6 +17,12 @@ from mjx_dher.envs.engines import Controls, Physics, check_shape, make_engine
 from mjx_dher.types import Array, DistanceFn, EnvSpec, GoalObs, PRNGKey
 from mjx_dher.validation import check_count, check_number
 
+# Methods that `describe` describes, with its entries that are left out if a class replaces a method and not `describe`.
+_DESCRIBED = {
+    **{"controls": ["controls"], "advance": ["controls"], "observe": ["layout", "joints", "sensors"]},
+    **{name: ["goal"] for name in ("achieved", "sample_goal", "goal_distance", "reached")},
+}
+
 
 class Range(NamedTuple):
     """Range of a free body's or a joint's start."""
@@ -106,7 +112,47 @@ class SimulatedTask(GoalEnv):
         """Whether this is a possible state of the task, bool []. NaN is not."""
 
     def check_own(self) -> None:
-        """Checks methods that a subclass replaces, once sizes are known."""
+        """Finds the observation's size if a subclass or mixin replaces `observe`, and checks an own `achieved`."""
+        owners = type(self).__mro__
+        base = owners[owners.index(SimulatedTask) - 1]  # MujocoTask or FetchEnv
+        own = [name for name in ("observe", "achieved", "spec") if getattr(type(self), name) is not getattr(base, name)]
+        if "observe" in own and (shape := self._shape_of("observe")) is not None:
+            if "spec" not in own and len(shape) != 1:
+                raise ValueError(f"observe must return a vector; got shape {list(shape)}")
+            self.observation_size = shape[0] if len(shape) == 1 else self.observation_size
+        if "achieved" in own and (shape := self._shape_of("achieved")) not in (None, (self.goal_size,)):
+            raise ValueError(f"achieved must return a goal [{self.goal_size}]; got shape {list(shape)}")
+
+    def _shape_of(self, method: str) -> tuple[int, ...] | None:
+        """Shape of what a method returns for the start, or None if a subclass's constructor sets later what it uses."""
+        try:
+            rest: Physics = self.vary(jax.tree.map(jnp.asarray, self._rest), jax.random.key(0))
+            given = jax.eval_shape(getattr(self, method), rest)
+        except AttributeError:
+            return None
+        if not hasattr(given, "shape"):
+            raise ValueError(f"{method} must return an array; got a {type(given).__name__}")
+        return tuple(given.shape)
+
+    @property
+    def _own(self) -> list[str]:
+        """Methods of `_DESCRIBED` that a subclass or mixin replaces, and its `describe` does not."""
+        owners = type(self).__mro__
+        at = lambda name: next((i for i, owner in enumerate(owners) if name in vars(owner)), len(owners))  # noqa: E731
+        return [name for name in _DESCRIBED if at(name) < at("describe")]
+
+    def describe(self) -> dict[str, Any]:
+        """Entries of `robot_interface`, as JSON. By default none."""
+        return {}
+
+    @property
+    def robot_interface(self) -> dict[str, Any]:
+        """Entries of `describe`, for policy files. Those that own methods may contradict are left out, and "own" has these
+        methods.
+        """
+        lost = {entry for name in self._own for entry in _DESCRIBED[name]}
+        kept = {name: value for name, value in self.describe().items() if name not in lost}
+        return kept | ({"own": self._own} if self._own else {})
 
     @property
     def spec(self) -> EnvSpec:

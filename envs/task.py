@@ -49,13 +49,6 @@ _ELSEWHERE = {
     **dict.fromkeys(("observation_size", "layout"), "observations"),
     **{"dt": "hz", "goal_size": "goal", "action_size": "control", "rest_action": "start"},
 }
-# Methods that an interface describes, with the entries that are left out if a subclass replaces a method and not `describe`.
-_DESCRIBED = {
-    "controls": ["controls"],
-    "advance": ["controls"],
-    "observe": ["layout", "joints", "sensors"],
-    "achieved": ["goal"],
-}
 
 
 class MujocoTask(SimulatedTask):
@@ -84,7 +77,7 @@ class MujocoTask(SimulatedTask):
             raise ValueError(f"controls is a method of a task; the field is control; got controls = {self.controls!r}")
         _check_names(type(self))
         declared = self.control if isinstance(self.control, (list, tuple)) else (self.control,)
-        self.parts = [_checked("control", part, Control).bind(self.model) for part in declared]
+        self.parts = [_bound("control", part, Control, self.model) for part in declared]
         for part in self.parts:
             _check_has("control", part, Control, "size", "apply")
         self.action_size = sum(part.size for part in self.parts)
@@ -94,13 +87,12 @@ class MujocoTask(SimulatedTask):
         goal = copy.copy(_checked("goal", getattr(self, "goal", None), Goal))
         if self._asked is not None:
             goal.threshold = self._asked
-        _check_has("goal", goal, Goal, "threshold", "achieved", "sample")
-        self.goal = goal.bind(self.model)
-        _check_has("goal", self.goal, Goal, "size", "distance")
+        self.goal = _bound("goal", goal, Goal, self.model)
+        _check_has("goal", self.goal, Goal, "size", "threshold", "achieved", "sample", "distance")
         self.goal_size, self.threshold = self.goal.size, self.goal.threshold
         if not hasattr(type(self), "goal_distance"):
             self.goal_distance = self.goal.distance
-        self.start = _checked("start", self.start, Start).bind(self.model)
+        self.start = _bound("start", self.start, Start, self.model)
         self._rest, self._hold = self.start.physics, self.start.hold
         self.rest_action = np.asarray(self._rest_of(self._hold.ctrl))  # keeps the start
         self._object = next((each for each in self.start.drawn if len(each.low) == 3), None)
@@ -121,35 +113,6 @@ class MujocoTask(SimulatedTask):
         probes.check_stable(self.model, rest, np.asarray(self._hold.ctrl), self.dt * self.episode_length)
         probes.check_overlaps(self.model, rest, self.start.drawn)
         probes.check_reachable(self.model, rest, self.goal)
-
-    def check_own(self) -> None:
-        if "observe" in self._own:
-            (self.observation_size,) = self._shape_of("observe")
-        if "achieved" in self._own and self._shape_of("achieved") != (self.goal_size,):
-            raise ValueError(f"achieved must return a goal [{self.goal_size}]; got shape {list(self._shape_of('achieved'))}")
-
-    @property
-    def _own(self) -> list[str]:
-        """Methods of `_DESCRIBED` that a subclass of the class with `describe` replaces."""
-        owner = lambda name: next(base for base in type(self).__mro__ if name in vars(base))  # noqa: E731
-        describes = owner("describe")
-        return [name for name in _DESCRIBED if owner(name) is not describes and issubclass(owner(name), describes)]
-
-    def _shape_of(self, method: str) -> tuple[int, ...]:
-        """Shape of what a method returns for the start."""
-        shape = jax.eval_shape(getattr(self, method), jax.tree.map(jnp.asarray, self._rest)).shape
-        if len(shape) != 1:
-            raise ValueError(f"{method} must return a vector; got shape {list(shape)}")
-        return shape
-
-    @property
-    def robot_interface(self) -> dict[str, Any]:
-        """Entries of `describe`, for policy files. Those that a subclass's methods may contradict are left out, and "own" has
-        these methods.
-        """
-        lost = {entry for name in self._own for entry in _DESCRIBED[name]}
-        kept = {name: value for name, value in self.describe().items() if name not in lost}
-        return kept | ({"own": self._own} if self._own else {})
 
     def describe(self) -> dict[str, Any]:
         """Controls, goal, observation layout, and names of joints and sensors of its entries, as JSON."""
@@ -301,10 +264,16 @@ def _checked(field: str, value: Any, kind: type) -> Any:
     return value
 
 
+def _bound(field: str, value: Any, kind: type, model: mujoco.MjModel) -> Any:
+    """The bound value. Raises ValueError if it, or what its `bind` returns, is of another kind."""
+    name = f"what bind of {field} {type(value).__name__} returns"
+    return _checked(name, _checked(field, value, kind).bind(model), kind)
+
+
 def _check_has(field: str, value: Any, kind: type, *names: str) -> None:
     """Raises ValueError if a control or goal lacks a name, or has only what the base class `kind` says of it."""
-    lacks = lambda name: not hasattr(value, name) or (hasattr(kind, name) and getattr(type(value), name) is getattr(kind, name))  # noqa: E731
-    if lacking := [name for name in names if lacks(name)]:
+    lacks = lambda name: getattr(getattr(value, name), "__func__", 0) is getattr(kind, name, None)  # noqa: E731
+    if lacking := [name for name in names if not hasattr(value, name) or lacks(name)]:
         raise ValueError(
             f"{field} {type(value).__name__} needs {' and '.join(lacking)}, as {kind.__module__}.{kind.__name__} says"
         )

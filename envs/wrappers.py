@@ -78,11 +78,11 @@ class Wrapper:
         return WrapperState(inner, _observed(inner, observation), memory)
 
     def step(self, state: WrapperState, action: Array) -> WrapperState:
-        """State after one step with an action [A], which is clipped to [-1, 1]."""
-        if jnp.shape(action) != (self.env.action_size,):
-            raise ValueError(f"action must be [{self.env.action_size}]; got shape {list(jnp.shape(action))}")
-        clipped = jnp.where(jnp.isfinite(action), jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0), jnp.nan)  # which fails
-        memory, action = self.act(state.memory, clipped)
+        """State after one step with an action [A], which is clipped to [-1, 1], except NaN and infinity."""
+        action = jnp.asarray(action, jnp.float32)
+        if action.shape != (self.env.action_size,):
+            raise ValueError(f"action must be [{self.env.action_size}]; got shape {list(action.shape)}")
+        memory, action = self.act(state.memory, jnp.where(jnp.isfinite(action), jnp.clip(action, -1.0, 1.0), action))
         return self._seen(self.env.step(state.inner, action), memory)
 
     def compute_reward(self, achieved_goal: Array, desired_goal: Array) -> Array:

@@ -53,3 +53,8 @@ def test_another_shape_kind_or_type_is_rejected(value: Any, shape: tuple[int, ..
 def test_a_traced_value_is_checked_while_it_is_traced() -> None:
     with pytest.raises(ValueError, match="x must"):
         jax.eval_shape(lambda x: check.array("x", x, (2,)), jnp.zeros(3))
+
+
+def test_a_state_that_is_one_array_is_named() -> None:
+    with pytest.raises(ValueError, match=r"^step must .*; it is float32\[2\] and becomes float32\[3\]$"):
+        check.kept("step", jnp.zeros(2), jnp.zeros(3))

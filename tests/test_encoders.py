@@ -156,3 +156,8 @@ def test_images_need_an_encoder():
     for name in ("ddpg", "td3"):
         with pytest.raises(ValueError, match=r"observation\['image'\] .* uint8\[4, 4, 1\] .*encoder"):
             learners.make(name, SMALL, IMAGES)
+
+
+def test_networks_are_an_object_of_their_class():
+    with refuses("networks", "Networks", "namespace"):
+        networks.with_encoder(types.SimpleNamespace(encoder=None, actor=None, critic=None))

@@ -126,6 +126,16 @@ ABOUT = {
 }
 
 
+def test_a_file_says_which_methods_of_its_task_are_own():
+    policy = dataclasses.replace(random_policy(), interface={"own": ["observe"]})
+    assert export.metadata(policy, RunSpec(env="slide", sampler="weighted", seed=3)) == ABOUT | {"own": '["observe"]'}
+
+
+def test_an_unknown_format_is_named_before_its_file(tmp_path):
+    with refuses("format must be one of onnx, safetensors; got 'pickle'"):
+        export.check("pickle", tmp_path / "policy.onnx", overwrite=False)
+
+
 def test_an_onnx_file_says_what_it_is(run):
     model = onnx.load(str(run / "policy.onnx"))
     onnx.checker.check_model(model, full_check=True)

@@ -157,10 +157,12 @@ def test_an_arms_observed_force_follows_its_varied_gain():
     np.testing.assert_allclose(after.obs["observation"][env.layout["force"]], [true], atol=1e-4)
 
 
-@pytest.mark.parametrize("arguments", [{}, {"frame_stack": 2}])
+@pytest.mark.parametrize("arguments", [{}, {"frame_stack": 2}, {"action_filter": 0.5}, {"action_delay": 1}])
 @pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
 def test_an_action_that_is_not_finite_fails(arguments, value):
     env = envs.make("reach", engine="native", **arguments)
     state = jax.jit(env.step)(env.reset(jax.random.key(0)), jnp.zeros(4).at[1].set(value))
+    if "action_delay" in arguments:
+        state = jax.jit(env.step)(state, jnp.zeros(4))
     assert bool(getattr(state, "inner", state).failed)
     assert not bool(getattr(fine := jax.jit(env.step)(env.reset(jax.random.key(0)), jnp.full(4, 9.0)), "inner", fine).failed)

@@ -12,14 +12,10 @@ from conftest import refuses
 
 from mjx_dher import envs
 from mjx_dher.envs import wrappers
-from mjx_dher.envs.controls import Control
-from mjx_dher.envs.goals import Goal
 from mjx_dher.envs.kinematics import pick, rounded
 from mjx_dher.envs.observations import Entry
 from mjx_dher.envs.robot import RobotLoop
 from mjx_dher.envs.task import JointDelta, JointPosition, Joints, Mocap, MujocoTask, Pose, Position, Rotation, Start
-from mjx_dher.testing import check_env
-from mjx_dher.testing.trial import ComponentError
 
 XML = """
 <mujoco><compiler angle="radian"/><option timestep="0.002"/>
@@ -235,114 +231,3 @@ def test_units_and_overlaps_of_drawn_starts_are_told():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Reach("native")
-
-
-class Longer(Reach):
-    def observe(self, physics):
-        return jnp.concatenate([super().observe(physics), jnp.sin(physics.qpos[:2])])
-
-
-class Slower(Reach):
-    def controls(self, physics, action):
-        return super().controls(physics, 0.1 * action)
-
-
-class Vouched(Longer):
-    describe = Reach.describe
-
-
-@pytest.mark.parametrize(
-    ("task", "lost", "own"), [(Longer, ["layout", "joints", "sensors"], "observe"), (Slower, ["controls"], "controls")]
-)
-def test_a_policy_file_leaves_out_what_own_methods_may_contradict(task, lost, own):
-    env, plain = task("native"), Reach("native").robot_interface
-    assert env.robot_interface == {name: value for name, value in plain.items() if name not in lost} | {"own": [own]}
-
-    def policy(obs):
-        return np.zeros(2)
-
-    policy.interface = env.robot_interface
-    RobotLoop(env, policy)
-    for policy.interface, other in ((env.robot_interface, Reach), (plain, task)):
-        with refuses("own", own, "policy"):
-            RobotLoop(other("native"), policy)
-
-
-def test_an_own_observation_may_be_longer_and_its_class_may_vouch_for_the_layout():
-    env = Longer("native")
-    assert (env.observation_size, env.spec.observation.shape) == (7, (7,))
-    check_env(env)
-    assert Vouched("native").robot_interface == Reach("native").robot_interface
-
-
-def test_own_distances_count():
-    class Far(Reach):
-        def goal_distance(self, achieved, desired):
-            return 100 * jnp.max(jnp.abs(achieved - desired), axis=-1)
-
-    env = Far("native")
-    near = jnp.array([0.03, 0.02, 0.0])
-    assert not env.reached(jnp.zeros(3), near)
-    assert Reach("native").reached(jnp.zeros(3), near)
-    np.testing.assert_allclose(env.goal_distance(jnp.zeros(3), near), 3.0)
-
-
-class Grip(Control):
-    size = 2
-
-    def apply(self, physics, action, controls):
-        return dataclasses.replace(controls, ctrl=controls.ctrl.at[:2].set(action))
-
-
-class Corner(Goal):
-    size, threshold = 2, 0.1
-
-    def achieved(self, physics):
-        return physics.qpos[:2]
-
-    def sample(self, key):
-        return jax.random.uniform(key, (2,))
-
-    def distance(self, achieved, desired):
-        return jnp.linalg.norm(achieved - desired, axis=-1)
-
-
-def test_an_own_control_and_an_own_goal_need_few_methods():
-    env = type("Own", (Reach,), {"control": Grip(), "goal": Corner()})("native")
-    assert (env.action_size, env.goal_size) == (2, 2)
-    check_env(env)
-
-
-@pytest.mark.parametrize(
-    ("declared", "parts"),
-    [
-        ({"threshold": 0.01}, ("threshold", "the goal's threshold")),
-        ({"dt": 0.1}, ("dt", "hz")),
-        ({"observation_size": 7}, ("observation_size", "observations")),
-        ({"control": "yaw"}, ("control", "'yaw'")),
-        ({"control": type("Bare", (Control,), {"size": 1})()}, ("Bare", "apply")),
-        ({"goal": type("Bare", (Corner,), {"sample": Goal.sample})()}, ("Bare", "sample")),
-        ({"goal": type("Bare", (Goal,), {"size": 2, "threshold": 1, "achieved": 1, "sample": 1})()}, ("Bare", "distance")),
-        ({"achieved": lambda self, physics: physics.qpos[:2]}, ("achieved", "[3]", "[2]")),
-        ({"observe": lambda self, physics: physics.qpos[None]}, ("observe", "vector")),
-    ],
-)
-def test_what_an_own_task_gets_nearly_right_is_named(declared, parts):
-    with refuses(*parts):
-        type("Own", (Reach,), declared)("native")
-
-
-def test_a_scale_in_degrees_is_told():
-    with pytest.warns(UserWarning, match=r"a_yaw by 20 per action, and its range is 4 wide"):
-        type("Own", (Reach,), {"control": JointDelta("yaw", scale=20)})("native")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        type("Own", (Reach,), {"control": JointDelta("yaw", scale=1)})("native")
-
-
-def test_a_reached_that_is_no_boolean_and_a_constant_reward_are_told():
-    reached = lambda self, achieved, desired: self.goal_distance(achieved, desired)  # noqa: E731
-    with refuses("reached of goals [3]", "booleans", "float32", error=ComponentError):
-        check_env(type("Own", (Reach,), {"reached": reached})("native"))
-    with pytest.warns(UserWarning, match="compute_reward is 0 for all goals"):
-        check_env(Reach("native", distance_threshold=9.0))

@@ -77,6 +77,12 @@ def test_eval_and_resume_say_which_file_changed_since(own, tmp_path, capsys):
     assert "has changed" not in capsys.readouterr().out
 
 
+def test_only_an_environment_has_files_of_a_model():
+    for field in ("sampler", "metric", "networks", "env"):
+        told = fingerprint.file_of(field, "own_task.py 3fa9c1d2e4")
+        assert told == "own_task.py" + " or a file of its model" * (field == "env")
+
+
 def write(folder, files):
     for name, content in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,7 @@
 """Wrappers: noise, delay, filter and frame stack, by hand on a point mass, and on tasks by name."""
 
 import pickle
+import warnings
 from typing import NamedTuple
 
 import jax
@@ -235,3 +236,19 @@ def test_shapes_that_do_not_fit_are_rejected():
     for wrapper in (ActionDelay(Point(), 2), ActionFilter(Point(), 0.5)):
         with refuses("action", 2, 1):
             wrapper.step(wrapper.reset(KEY), jnp.zeros(1))
+
+
+def test_an_action_may_be_a_list_and_infinity_arrives_where_it_is_clipped():
+    for wrapper in (FrameStack(Point(), 2), ActionFilter(Point(), 0.0)):
+        state = wrapper.reset(KEY)
+        for action in ([0.5, -0.5], np.array([0.5, -0.5])):
+            np.testing.assert_allclose(wrapper.step(state, action).inner.obs["observation"][:2], [0.5, -0.5])
+        with refuses("action", 2, 3):
+            wrapper.step(state, [0.0, 0.0, 0.0])
+        infinite = wrapper.step(state, jnp.array([jnp.inf, -jnp.inf]))
+        np.testing.assert_array_equal(infinite.inner.obs["observation"][:2], [1.0, -1.0])
+    env = envs.make("reach", engine="native", frame_stack=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # JAX warns of shapes of lists
+        env.step(env.reset(KEY), [0.0] * 4)
+        env.env.step(env.env.reset(KEY), [0.0] * 4)

@@ -30,7 +30,8 @@ class Contents(NamedTuple):
 
 
 def check(file_format: str, out: Path, overwrite: bool) -> None:
-    """Raises ValueError early if `file_format`'s package is missing, or `out` cannot or must not be written."""
+    """Raises ValueError early if `file_format` is unknown, its package is missing, or `out` cannot or must not be written."""
+    lookup.check_name("format", file_format, FORMATS)
     files.check_file(out, [f".{file_format}"], overwrite)
     lookup.require_extra(f"format {file_format}", file_format, "export")
 
