@@ -222,3 +222,8 @@ def test_a_minari_episode_that_ends_at_its_goal_is_not_terminal_for_other_goals(
     monkeypatch.setattr(demonstrations, "find_demonstrations", lambda source: tmp_path)
     assert read_demonstrations("any", env, 6).terminal.tolist() == [False, True]
     assert read_demonstrations("any", Walk(), 6).terminal.tolist() == [True, True]
+
+
+def test_a_check_of_components_takes_no_demonstrations(capsys):
+    assert cli.main(["check", "--demonstrations", "episodes.npz"]) == 2
+    assert "--demonstrations" in capsys.readouterr().err

@@ -234,7 +234,7 @@ JOINT = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="j" ty
         ("hinge", "-2 2", 1, "j by 5 per action, and its range is 4 wide"),
         ("hinge", "-4 4", 2, "j by 5 per action, and its range is 4 wide"),
         ("hinge", "-4 4", -2, "j by 5 per action, and its range is 4 wide"),
-        ("hinge", "0.7 5.7", 1, None),  # as wide as the scale, up to rounding
+        ("hinge", "3.4 8.4", 1, None),  # as wide as the scale, up to rounding
         ("hinge", "-4 4", 0.5, None),
         ("hinge", "-2 2", 0, None),
         ("slide", "-2 2", 1, None),  # has no degrees
