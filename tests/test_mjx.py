@@ -167,7 +167,7 @@ def test_free_bodies_are_implicit_in_gyroscopic_forces_as_in_mujoco_c():
         mass = np.zeros((model.nv, model.nv))
         mujoco.mj_fullM(explicit, before, mass)
         block, frame, force = mass[dofs, dofs], before.xmat[1 + body].reshape(3, 3), before.qfrc_smooth[dofs]
-        numbers = (np.full(6, damping), model.dof_armature[dofs], frame, qvel[dofs][3:], force)
+        numbers = (-damping * np.eye(6), model.dof_armature[dofs], frame, qvel[dofs][3:], force)
         shift = gyroscopic(model.opt.timestep, *map(jnp.asarray, (block, *numbers)))
         implicit = block + model.opt.timestep * damping * np.eye(6)
         moved = qvel[dofs] + model.opt.timestep * np.linalg.solve(implicit, force + shift)

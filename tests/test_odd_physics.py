@@ -77,6 +77,13 @@ def test_a_damped_tendon_couples_the_joints_of_one_body_as_in_mujoco_c(body, com
     np.testing.assert_allclose(played("jax", model, start, 1), played("native", model, start, 1), atol=1e-5)
 
 
+def test_a_damped_tendon_slows_a_body_that_spins_freely_as_in_mujoco_c():
+    body = re.sub("<joint.*/>", "<freejoint/>", SLIDES).format("").replace('size="0.1"', 'type="box" size="0.1 0.2 0.3"')
+    model = mujoco.MjModel.from_xml_string(COUPLED.format(body=body))
+    start = [1.0, 0.5, 0.3, 3.0, 1.4, 0.2]
+    np.testing.assert_allclose(played("jax", model, start, 1), played("native", model, start, 1), atol=1e-5)
+
+
 def test_programs_that_are_traced_at_once_have_their_own_derivatives(monkeypatch):
     chain = re.sub(r"</body>\n(<body pos=\"0 1 0\">.*)</body></worldbody>", r"\1</body></body></worldbody>", BRANCHES)
     models = [mujoco.MjModel.from_xml_string(xml.format(damping=' damping="50"', actuator="")) for xml in (BRANCHES, chain)]

@@ -130,13 +130,11 @@ def implicit(fixed: mujoco.MjModel, alone: np.ndarray, model: mjx.Model, data: m
     if len(alone):
         rows = fixed.jnt_dofadr[alone][:, None] + np.arange(6)
         force = data.qfrc_smooth + data.qfrc_constraint
-        blocks = mjx.full_m(model, data)[rows[:, :, None], rows[:, None, :]]
+        pairs = rows[:, :, None], rows[:, None, :]
+        blocks, slopes = mjx.full_m(model, data)[pairs], mjx.deriv_smooth_vel(model, data)[pairs]
         frames = data.xmat[fixed.jnt_bodyid[alone]]
-        damping = jnp.asarray(model.dof_damping)[rows]
-        if fixed.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_DAMPER):
-            damping = jnp.zeros_like(damping)
         armature = fixed.dof_armature[rows].astype(np.float32)
-        args = (blocks, damping, armature, frames, data.qvel[rows][:, 3:], force[rows])
+        args = (blocks, slopes, armature, frames, data.qvel[rows][:, 3:], force[rows])
         shifts = jax.vmap(functools.partial(gyroscopic, float(fixed.opt.timestep)))(*args)
         data = data.replace(qfrc_smooth=data.qfrc_smooth.at[rows].add(shifts))
     token = _MASK.set(_in_common(fixed))
@@ -160,15 +158,14 @@ def _in_common(model: mujoco.MjModel) -> np.ndarray:
     return common
 
 
-def gyroscopic(
-    timestep: float, mass: Array, damping: Array, armature: Array, frame: Array, omega: Array, force: Array
-) -> Array:
+def gyroscopic(timestep: float, mass: Array, slope: Array, armature: Array, frame: Array, omega: Array, force: Array) -> Array:
     """Force [6] on a free body that makes its acceleration implicit in gyroscopic forces.
 
     Args:
       timestep: s.
       mass: [6, 6] of its position (world's axes) and orientation (its own axes).
-      damping, armature: [6].
+      slope: [6, 6] derivative of the smooth forces on it by its velocity.
+      armature: [6].
       frame: [3, 3] its orientation.
       omega: [3] rad/s in its own axes.
       force: [6] on it.
@@ -179,7 +176,7 @@ def gyroscopic(
     linear = frame @ (lever @ turn - 2.0 * turn @ lever)
     angular = turn @ inertia - _skew(inertia @ omega)
     change = timestep * jnp.concatenate([linear, angular])
-    implicit = (mass + timestep * jnp.diag(damping)).at[:, 3:].add(change)
+    implicit = (mass - timestep * slope).at[:, 3:].add(change)
     return -change @ jnp.linalg.solve(implicit, force)[3:]
 
 
