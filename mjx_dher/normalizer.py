@@ -27,7 +27,7 @@ def init(like: PyTree) -> PyTree:
     def of(x: Array) -> NormalizerState | None:
         if not jnp.issubdtype(x.dtype, jnp.floating):
             return None
-        return NormalizerState(count=jnp.zeros(()), mean=jnp.zeros(x.shape), var=jnp.ones(x.shape))
+        return NormalizerState(jnp.zeros((), jnp.float32), jnp.zeros(x.shape, jnp.float32), jnp.ones(x.shape, jnp.float32))
 
     return jax.tree.map(of, like)
 

@@ -137,7 +137,7 @@ def choose(
     """
     choose_key, coin_key = jax.random.split(key)
     indices = _choose(priority, choose_key, sample, batch, number, context)
-    coin = jax.random.uniform(coin_key, (number,)) < context.hparams.priority_fraction
+    coin = jax.random.uniform(coin_key, (number,), jnp.float32) < context.hparams.priority_fraction
     first = CANDIDATES * jnp.arange(number, dtype=jnp.int32)
     kept = jnp.where(coin, jnp.clip(indices, 0, CANDIDATES * number - 1), first)
     return jax.tree.map(lambda x: x[kept], (sample, batch))
@@ -157,7 +157,7 @@ def by_weight(weigh: Callable[[Sample, Batch, Context], Array]) -> ChooseFn:
         weight = weight * replay.sum_factor(weight)
         total = jnp.cumsum(jnp.where(jnp.sum(weight, axis=1, keepdims=True) > 0, weight, 1.0), axis=1)
         # 1 - u lies in (0, 1], so a weight of 0 is never the first to reach it.
-        threshold = (1.0 - jax.random.uniform(key, (number, 1))) * total[:, -1:]
+        threshold = (1.0 - jax.random.uniform(key, (number, 1), jnp.float32)) * total[:, -1:]
         place = jnp.argmax(total >= threshold, axis=1).astype(jnp.int32)
         return CANDIDATES * jnp.arange(number, dtype=jnp.int32) + place
 
@@ -184,7 +184,7 @@ def join(choices: Sequence[Priority | PriorityFn]) -> Priority:
 
 
 def _weigh(priority: Priority, episode: Episode, context: Context) -> Array:
-    weight = priority.weigh(episode, context) if priority.weigh else jnp.zeros(())
+    weight = priority.weigh(episode, context) if priority.weigh else jnp.zeros((), jnp.float32)
     return jnp.asarray(weight, jnp.float32)
 
 

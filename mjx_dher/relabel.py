@@ -105,7 +105,7 @@ def relabel(sample: Sample, sampler: Sampler | LogWeightsFn, context: Context, k
     batch_size = sample.step.shape[0]
     k = jnp.asarray(hparams.her_k, jnp.float32)
     share = jnp.where(jnp.isinf(k), 1.0, k / (k + 1.0))
-    relabelled = jax.random.uniform(coin_key, (batch_size,)) < share
+    relabelled = jax.random.uniform(coin_key, (batch_size,), jnp.float32) < share
     sampler = samplers.of_distance(samplers.make(sampler), context.goal_distance)
     hindsight = hindsight_goals(sample, sampler, hparams, goal_key)
     desired_goal = jnp.where(relabelled[:, None], hindsight.goals, sample.desired_goal)

@@ -234,10 +234,10 @@ def draw_rows(state: ReplayState, key: PRNGKey, batch_size: int, fraction: Array
       weights: `cumulative(state)`.
     """
     coin_key, bits_key = jax.random.split(key)
-    any_bits, rank_bits = jax.random.bits(bits_key, (2, batch_size))
+    any_bits, rank_bits = jax.random.bits(bits_key, (2, batch_size), jnp.uint32)
     by_priority = _row_at(weights.priority, rank_bits)
     any_row = randint_from_bits(any_bits, state.size) if weights.length is None else _row_at(weights.length, any_bits)
-    coin = jax.random.uniform(coin_key, (batch_size,)) < fraction
+    coin = jax.random.uniform(coin_key, (batch_size,), jnp.float32) < fraction
     return jnp.where(coin & (weights.priority[-1] > 0), by_priority, any_row)
 
 
@@ -261,7 +261,7 @@ def newest_and_others(state: ReplayState, key: PRNGKey, newest: int, others: int
     The newest are partly empty until that many episodes have been written. The ring must not be empty if `others` is positive.
     """
     new = (state.cursor - 1 - jnp.arange(newest, dtype=jnp.int32)) % capacity(state)
-    return jnp.concatenate([new, randint_from_bits(jax.random.bits(key, (others,)), state.size)])
+    return jnp.concatenate([new, randint_from_bits(jax.random.bits(key, (others,), jnp.uint32), state.size)])
 
 
 def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None = None) -> Sample:
@@ -275,7 +275,7 @@ def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None
       ValueError: `batch_size` is below 1, or `rows` are not integers [B].
     """
     check_size("batch_size", batch_size)
-    row_bits, step_bits = jax.random.bits(key, (2, batch_size))
+    row_bits, step_bits = jax.random.bits(key, (2, batch_size), jnp.uint32)
     episodes = state.episodes
     if rows is not None:
         rows = array("rows [B]", rows, (batch_size,), jnp.integer)
@@ -301,7 +301,7 @@ def sample(state: ReplayState, key: PRNGKey, batch_size: int, rows: Array | None
 
 def sample_pool(state: ReplayState, key: PRNGKey, batch_size: int) -> Pool:
     """Draws one uniform episode for each of `batch_size` transitions. The ring must not be empty."""
-    rows = randint_from_bits(jax.random.bits(key, (batch_size,)), state.size)
+    rows = randint_from_bits(jax.random.bits(key, (batch_size,), jnp.uint32), state.size)
     return Pool(state.episodes.achieved_goal[rows], state.episodes.length[rows])
 
 

@@ -59,12 +59,12 @@ def future_mask(num_goals: int, step: Array, length: Array | None = None) -> Arr
 
 def uniform(mask: Array) -> Array:
     """Log weights [T+1] of equally likely goals."""
-    return jnp.where(mask, 0.0, -jnp.inf)
+    return jnp.where(mask, jnp.float32(0.0), -jnp.inf)
 
 
 def episode(achieved: Array, desired: Array, step: Array, hparams: HParams) -> Array:
     """Any goal of the episode, uniformly."""
-    return jnp.zeros(achieved.shape[0])
+    return jnp.zeros(achieved.shape[0], jnp.float32)
 
 
 def measure(metric: MetricFn, achieved: Array, desired: Array) -> Array:
@@ -222,8 +222,8 @@ def draw(key: PRNGKey, log_weights: Array) -> Array:
     possible = weights > 0
     # At these lengths, a product with a triangle of ones is a faster prefix sum than a scan. Its last bit may not be monotone,
     # so only possible indices count in the total and in the result.
-    cumulative = jnp.matmul(weights, jnp.triu(jnp.ones((num_goals, num_goals))), precision=jax.lax.Precision.HIGHEST)
+    cumulative = jnp.matmul(weights, jnp.triu(jnp.ones([num_goals] * 2, jnp.float32)), precision=jax.lax.Precision.HIGHEST)
     total = jnp.max(jnp.where(possible, cumulative, 0.0), axis=-1)
-    threshold = jax.random.uniform(key, log_weights.shape[:-1]) * total
+    threshold = jax.random.uniform(key, log_weights.shape[:-1], jnp.float32) * total
     reached = possible & (cumulative > threshold[..., None])
     return jnp.min(jnp.where(reached, jnp.arange(num_goals, dtype=jnp.int32), num_goals), axis=-1)

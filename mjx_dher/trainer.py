@@ -189,7 +189,7 @@ def _add_episodes(loop: Loop, state: TrainState, episodes: Episode) -> TrainStat
 def _epoch(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     state, cycles = jax.lax.scan(lambda state, _: _cycle(loop, state), state, length=loop.config.cycles_per_epoch)
     key, eval_key = jax.random.split(state.key)
-    discarded = split.total(jnp.sum(cycles.pop("discarded_episodes")), loop.axis_name)
+    discarded = split.total(jnp.sum(cycles.pop("discarded_episodes"), dtype=jnp.int32), loop.axis_name)
     outcome = _evaluate(loop, state, eval_key, loop.config.eval_episodes)
     means = split.mean(jax.tree.map(lambda x: replay.mean(x, len(x)), cycles), loop.axis_name)
     evaluated = split.mean((evaluate.summary(outcome), evaluate.faults(outcome)), loop.axis_name)
@@ -229,7 +229,7 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     metrics = {
         "train_success_rate": jnp.mean(outcome.success),
         "train_return_mean": evaluate.return_mean(outcome),
-        "discarded_episodes": jnp.sum(~outcome.valid),
+        "discarded_episodes": jnp.sum(~outcome.valid, dtype=jnp.int32),
         "priority_mean": priorities.mean(loop.priority, ring, weights, outcome.valid, context),
         **({"train_length_mean": jnp.mean(outcome.length, dtype=jnp.float32)} if loop.spec.ends else {}),
         **evaluate.faults(outcome),
@@ -240,7 +240,7 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
 
 
 def _context(loop: Loop, learner: PyTree, hparams: HParams, updates: Array) -> Context:
-    progress = updates / config_lib.num_updates(loop.config, loop.spec.episode_length)
+    progress = jnp.asarray(updates / config_lib.num_updates(loop.config, loop.spec.episode_length), jnp.float32)
     values = learners.values_of(loop.learner, learner, hparams) if loop.uses_values else None
     return context_lib.of_env(loop.env, hparams, progress=progress, updates=updates, values=values)
 

@@ -80,7 +80,7 @@ def hindsight_goals(key: PRNGKey, obs: GoalObs, ring: ReplayState, context: Cont
     row_key, match_key = jax.random.split(key)
     start, desired = obs["achieved_goal"], obs["desired_goal"]
     number = desired.shape[0]
-    rows = replay.randint_from_bits(jax.random.bits(row_key, (number,)), ring.size)
+    rows = replay.randint_from_bits(jax.random.bits(row_key, (number,), jnp.uint32), ring.size)
     achieved = ring.episodes.achieved_goal[rows]
     shape = achieved.shape[:2]
     first = jax.tree.map(lambda x: jnp.broadcast_to(x[rows, :1], (*shape, *x.shape[2:])), ring.episodes.observation)

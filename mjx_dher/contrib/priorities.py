@@ -138,13 +138,14 @@ def pick_curriculum(key: PRNGKey, sample: Sample, batch: Batch, number: int, con
 
     def add(state: tuple[Array, Array], key: PRNGKey) -> tuple[tuple[Array, Array], Array]:
         covers, free = state  # [2 * number] F, and which may still be chosen
-        compared = jax.lax.top_k(jnp.where(free, jax.random.uniform(key, (size,)), -1.0), min(_COMPARED, number + 1))[1]
+        order = jnp.where(free, jax.random.uniform(key, (size,), jnp.float32), -1.0)
+        compared = jax.lax.top_k(order, min(_COMPARED, number + 1))[1]
         value = covers[compared] - cost[compared]
         led = value > jnp.concatenate([jnp.array([-jnp.inf]), jax.lax.cummax(value)[:-1]])
         best = compared[jnp.argmax(value)]
         return (covers.at[compared].multiply(jnp.where(led, 0.0, 1.0)), free.at[best].set(False)), best
 
-    covers = jnp.zeros(size).at[nearest].add(alike)
+    covers = jnp.zeros(size, alike.dtype).at[nearest].add(alike)
     _, chosen = jax.lax.scan(add, (covers, jnp.ones(size, bool)), jax.random.split(key, number))
     return chosen
 
@@ -157,7 +158,7 @@ def pick_diverse(key: PRNGKey, sample: Sample, batch: Batch, number: int, contex
     """
     size = sample.step.shape[0]
     if number == 1:
-        return jax.random.randint(key, (1,), 0, size)
+        return jax.random.randint(key, (1,), 0, size, jnp.int32)
     if number != 2:
         raise ValueError(f"number must be 1 or 2 for pick_diverse; got {number}")
     determinants = -jnp.expm1(-_squared_distances(batch.desired_goal) / _DIVERSE_WIDTH**2)

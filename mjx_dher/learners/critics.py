@@ -56,7 +56,7 @@ class Categorical(Critics):
 
     def returns(self, outputs: Array, low: Array | float, high: Array | float) -> Array:
         """Mean returns [C, B, 1]."""
-        share = jnp.linspace(0.0, 1.0, self.size)
+        share = jnp.linspace(0.0, 1.0, self.size, dtype=jnp.float32)
         return low + (high - low) * jnp.sum(jax.nn.softmax(outputs) * share, axis=-1, keepdims=True)
 
     def error(self, outputs: Array, atoms: Array, low: Array | float, high: Array | float) -> Array:

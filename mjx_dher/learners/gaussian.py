@@ -27,7 +27,7 @@ class Gaussian(ActorKind):
     has_target = False
 
     def init(self, network: Any, key: PRNGKey, *inputs: PyTree) -> PyTree:
-        return {"network": network.init(key, *inputs), "log_alpha": jnp.zeros(())}
+        return {"network": network.init(key, *inputs), "log_alpha": jnp.zeros((), jnp.float32)}
 
     def act(self, network: Any, params: PyTree, observation: Array, goal: Array) -> Array:
         """Tanh of the means, [..., A]."""
