@@ -174,7 +174,7 @@ def where_each(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
 
     def select(a: Array, b: Array) -> Array:
         if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
-            return jax.random.wrap_key_data(select(jax.random.key_data(a), jax.random.key_data(b)))
+            return jax.random.wrap_key_data(select(*map(jax.random.key_data, (a, b))), impl=jax.random.key_impl(a))
         return jnp.where(condition.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
 
     return jax.tree.map(select, yes, no)

@@ -74,7 +74,7 @@ def _from_plain(array: np.ndarray, like: Any) -> Array:
     if array.shape != numbers.shape or array.dtype != (f"u{dtype.itemsize}" if dtype.kind == "V" else dtype):
         raise ValueError(f"got {array.dtype}{list(array.shape)} for {like.dtype}{list(like.shape)}")
     value = jnp.asarray(array.view(dtype))
-    return jax.random.wrap_key_data(value) if _is_key(like) else value
+    return jax.random.wrap_key_data(value, impl=jax.random.key_impl(jnp.empty((), like.dtype))) if _is_key(like) else value
 
 
 def _is_key(leaf: Any) -> bool:

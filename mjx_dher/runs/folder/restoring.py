@@ -175,7 +175,7 @@ def _place(arrays: Sequence[np.ndarray], template: Any) -> Any:
             value = jnp.array(array)  # a copy, because the next epoch reuses its memory
         else:
             value = jax.make_array_from_callback(array.shape, leaf.sharding, lambda index: array[index])
-        return jax.random.wrap_key_data(value) if is_key(leaf) else value
+        return jax.random.wrap_key_data(value, impl=jax.random.key_impl(jnp.empty((), leaf.dtype))) if is_key(leaf) else value
 
     return jax.tree.unflatten(treedef, [put(array, leaf) for array, leaf in zip(arrays, leaves)])
 
