@@ -5,6 +5,7 @@ A file is a Minari data set, or an .npz with the arrays of a batched `Episode`. 
 """
 
 import functools
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -23,12 +24,14 @@ _OPTIONAL = ("length", "terminal")
 
 
 def write_demonstrations(path: Path, episodes: Episode) -> None:
-    """Writes N episodes from `rollout` to an .npz file."""
+    """Writes N episodes from `rollout` to an .npz file. Raises ValueError if `path` does not end in .npz."""
+    if not os.fspath(path).endswith(".npz"):
+        raise ValueError(f"path must end in .npz, which `read_demonstrations` needs; got {os.fspath(path)!r}")
     arrays: dict[str, Any] = {name: np.asarray(leaf) for name, leaf in _named(episodes).items()}
     np.savez_compressed(path, **arrays)
 
 
-def read_demonstrations(source: str, env: Env, max_episodes: int) -> Episode:
+def read_demonstrations(source: str | os.PathLike[str], env: Env, max_episodes: int) -> Episode:
     """Reads at most `max_episodes` episodes from an .npz file, or the folder or name of a Minari data set.
 
     They are padded to the environment's episode length. Raises ValueError if the file cannot be read, or its episodes do not

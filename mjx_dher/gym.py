@@ -6,11 +6,13 @@
 Importing this module registers them. JAX and MuJoCo are loaded when an environment is made.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
+from mjx_dher.config import plain
 from mjx_dher.lookup import check_name, missing_extra
 from mjx_dher.tools.gym_cache import Programs, programs
 from mjx_dher.validation import check_count
@@ -64,7 +66,7 @@ class _GoalApi:
         # Padded to a power of two, because each new number of goals would be compiled again.
         num_goals = len(flat[0])
         padding = ((0, (1 << max(num_goals - 1, 0).bit_length()) - num_goals), (0, 0))
-        rewards = np.array(self._compiled.reward(*(np.pad(goals, padding) for goals in flat)))
+        rewards = np.array(self._compiled.reward(*(np.pad(goals, padding) for goals in flat)), np.float32)
         return rewards[:num_goals].reshape(achieved.shape[:-1])[()]
 
     def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
@@ -89,14 +91,13 @@ class _GoalApi:
         for goals in (achieved, desired):
             if goals.shape[-1:] != (size,):
                 raise ValueError(f"goals must end in an axis of {size}; got shapes {achieved.shape} and {desired.shape}")
-        achieved, desired = np.broadcast_arrays(achieved, desired)
-        return achieved, desired
+        return cast("tuple[np.ndarray, np.ndarray]", np.broadcast_arrays(achieved, desired))
 
     def _moved(self, program: Any, *arguments: Any) -> tuple[Obs, np.ndarray, dict[str, np.ndarray]]:
         """Takes the state that a program returns. Copies its observation, reward (float64) and info to writable arrays."""
         self._state = None
         state = program(*arguments)
-        obs = {key: _copied(value) for key, value in state.obs.items()}
+        obs = _nested(dict(state.obs), np.array)
         failed = getattr(state, "failed", np.zeros(np.shape(state.success), bool))
         info = {"is_success": np.array(state.success, np.float64), "failed": np.array(failed)}
         reward = np.array(state.reward, np.float64)
@@ -188,7 +189,7 @@ def make_custom(name: str, render_mode: str | None = None, episode_length: int |
     `gymnasium.make`, `max_episode_steps` can only make episodes shorter than that.
     """
     env = GymEnv(name, render_mode, **options)
-    length = env._compiled.spec.episode_length if episode_length is None else episode_length
+    length = plain(env._compiled.spec.episode_length if episode_length is None else episode_length)
     check_count("episode_length", length)
     return TimeLimit(env, length)
 
@@ -221,16 +222,14 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         if render_mode is not None:
             raise ValueError(f"render_mode must be None for a vectorized environment; got {render_mode!r}")
         self._compiled = programs(name, options)
-        env = self._compiled.env
         self.num_envs = num_envs
-        self.max_episode_steps = env.episode_length if max_episode_steps is None else max_episode_steps
+        self.max_episode_steps = plain(self._compiled.env.episode_length if max_episode_steps is None else max_episode_steps)
         check_count("max_episode_steps", self.max_episode_steps)
         self.single_observation_space, self.single_action_space = _spaces(self._compiled.spec)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._np_random, self._np_random_seed = zip(*(seeding.np_random() for _ in range(num_envs)))
-        self._steps = np.zeros(num_envs, int)  # number of steps in each episode
-        self._ended = np.zeros(num_envs, bool)
+        self._steps, self._ended = np.zeros(num_envs, int), np.zeros(num_envs, bool)  # steps of each episode
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -247,8 +246,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         streams = zip(_check_reset(options, seed, self.num_envs), zip(self._np_random, self._np_random_seed))
         self._compiled.check()
         self._np_random, self._np_random_seed = zip(*(old if one is None else seeding.np_random(one) for one, old in streams))
-        obs, _, infos = self._moved(self._restart)
-        return obs, infos
+        return self._moved(self._restart)[::2]
 
     def step(self, actions: np.ndarray) -> tuple[Obs, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Applies actions [N, A]. Returns arrays with leading [N]; `GymEnv.step` describes them.
@@ -262,7 +260,7 @@ class GymVectorEnv(_GoalApi, gymnasium.vector.VectorEnv[Obs, np.ndarray, np.ndar
         obs, rewards, infos = self._moved(self._advance, self._state, actions)
         rewards = np.where(restarted, 0.0, rewards)
         terminated, done = (np.asarray(flag) & ~restarted for flag in self._compiled.ended(self._state))
-        truncated = (done | (self._steps == self.max_episode_steps)) & ~terminated
+        truncated = done | (self._steps == self.max_episode_steps)  # like a `TimeLimit`, even if it is terminated, too
         self._ended = terminated | truncated
         return obs, rewards, terminated, truncated, infos
 
@@ -301,19 +299,22 @@ def _spaces(spec: "EnvSpec") -> tuple[Any, Any]:
 
 def _space(observation: Any) -> Any:
     """Space of an observation: a Box for an array, a Dict or Tuple for a tree."""
-    if isinstance(observation, Mapping):
-        return gymnasium.spaces.Dict({key: _space(value) for key, value in observation.items()})
-    if isinstance(observation, (tuple, list)):
-        return gymnasium.spaces.Tuple([_space(value) for value in observation])
-    dtype = np.dtype(observation.dtype)
-    low, high = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
-    return gymnasium.spaces.Box(low, high, observation.shape, dtype)
+
+    def box(leaf: Any) -> Any:
+        dtype, kind = leaf.dtype, leaf.dtype.kind
+        low, high = (-np.inf, np.inf) if kind == "f" else (0, 1) if kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+        return gymnasium.spaces.Box(low, high, leaf.shape, dtype)
+
+    return _nested(observation, box, gymnasium.spaces.Dict, gymnasium.spaces.Tuple)
 
 
-def _copied(tree: Any) -> Any:
+def _nested(tree: Any, leaf: Callable[[Any], Any], mapping: Any = dict, sequence: Any = tuple) -> Any:
+    """Converts a tree: arrays by `leaf`, dictionaries and the fields of dataclasses by `mapping`, tuples by `sequence`."""
+    if dataclasses.is_dataclass(tree):
+        tree = {f.name: getattr(tree, f.name) for f in dataclasses.fields(tree) if f.metadata.get("pytree_node", True)}
     if isinstance(tree, Mapping):
-        return {key: _copied(value) for key, value in tree.items()}
-    return tuple(map(_copied, tree)) if isinstance(tree, (tuple, list)) else np.array(tree)
+        return mapping({key: _nested(one, leaf, mapping, sequence) for key, one in tree.items()})
+    return sequence([_nested(one, leaf, mapping, sequence) for one in tree]) if isinstance(tree, (tuple, list)) else leaf(tree)
 
 
 def _checked(actions: Any, space: Any, state: Any) -> np.ndarray:

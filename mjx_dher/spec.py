@@ -205,9 +205,9 @@ def validate(spec: RunSpec, episode_length: int | None = None) -> None:
     validation.check_all(*names, *files, *_checks(spec, episode_length))
 
 
-def find_demonstrations(source: str) -> Path:
+def find_demonstrations(source: str | os.PathLike[str]) -> Path:
     """Path of an .npz file or Minari data set. Raises ValueError if it does not exist or is not trusted (`trust`)."""
-    root = Path(os.environ.get("MINARI_DATASETS_PATH") or os.path.expanduser("~/.minari/datasets"))
+    source, root = os.fspath(source), Path(os.environ.get("MINARI_DATASETS_PATH") or os.path.expanduser("~/.minari/datasets"))
     for path in (Path(source), root / source):
         if (source.endswith(".npz") and path.is_file()) or (source and (path / "data").is_dir()):
             from mjx_dher import trust

@@ -31,7 +31,7 @@ def _resting(achieved: Array, desired: Array, friction: float) -> Array:
     """Distances [T+1] between the points where the object would come to rest and the desired goal [G].
 
     An object that slides at v m/s against friction alone stops after v^2 / (2 friction g), at p_i + v_i |v_i| / (2 friction
-    g). A height among its coordinates is kept.
+    g). A height among its coordinates is kept. Steps take 0.04 s; `runs.program` rejects other tasks.
     """
     velocities = displacements(achieved) / STEP_SECONDS
     if achieved.shape[-1] > 2:

@@ -17,7 +17,7 @@ from mjx_dher import evaluate as evaluate_lib
 from mjx_dher import learners, priorities, samplers, trainer, validation
 from mjx_dher import spec as spec_lib
 from mjx_dher.config import HParams
-from mjx_dher.contract import check_steps, env_spec
+from mjx_dher.contract import STEP_SECONDS, check_steps, env_spec, step_seconds
 from mjx_dher.learners import Learner
 from mjx_dher.parallel import mesh, processes, split
 from mjx_dher.parallel.mesh import ONE, Layout
@@ -73,6 +73,8 @@ def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -
     """Training loop of runs that share a program, with their components."""
     validation.check_plan(spec.config, env.episode_length, layout.shards)
     config = config_lib.of_one_device(spec.config, layout.shards)
+    if any(of[2].startswith("resting_point") for of in choices.samplers) and round(step_seconds(env), 9) != STEP_SECONDS:
+        raise ValueError(f"metric resting_point needs a task with a dt of {STEP_SECONDS} s; got {step_seconds(env):g} s")
     generator = None
     if set(choices.generators) != {"reset"}:
         from mjx_dher.contrib import generators
