@@ -124,7 +124,7 @@ class SimulatedTask(GoalEnv):
             raise ValueError(f"achieved must return a goal [{self.goal_size}]; got shape {list(shape)}")
 
     def _shape_of(self, method: str) -> tuple[int, ...] | None:
-        """Shape of what a method returns for the start, or None if a subclass's constructor sets later what it uses."""
+        """Shape of a method's result for the start, or None if it uses an attribute that a constructor sets later."""
         try:
             rest: Physics = self.vary(jax.tree.map(jnp.asarray, self._rest), jax.random.key(0))
             given = jax.eval_shape(getattr(self, method), rest)

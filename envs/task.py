@@ -271,7 +271,7 @@ def _bound(field: str, value: Any, kind: type, model: mujoco.MjModel) -> Any:
 
 
 def _check_has(field: str, value: Any, kind: type, *names: str) -> None:
-    """Raises ValueError if a control or goal lacks a name, or has only what the base class `kind` says of it."""
+    """Raises ValueError if a control or goal lacks one of the names, or has only the empty method of `kind`, its base class."""
     lacks = lambda name: getattr(getattr(value, name), "__func__", 0) is getattr(kind, name, None)  # noqa: E731
     if lacking := [name for name in names if not hasattr(value, name) or lacks(name)]:
         raise ValueError(

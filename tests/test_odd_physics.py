@@ -72,7 +72,7 @@ COUPLED = """
 )
 def test_a_damped_tendon_couples_the_joints_of_one_body_as_in_mujoco_c(body, common):
     model = mujoco.MjModel.from_xml_string(COUPLED.format(body=body))
-    assert corrections._in_common(model).sum() == common
+    assert corrections.in_common(model).sum() == common
     start = np.resize([1.0, 0.5, -0.3], model.nv) * (np.arange(model.nv) < 3)
     np.testing.assert_allclose(played("jax", model, start, 1), played("native", model, start, 1), atol=1e-5)
 
@@ -173,3 +173,19 @@ def test_an_action_that_is_not_finite_fails(arguments, value):
         state = jax.jit(env.step)(state, jnp.zeros(4))
     assert bool(getattr(state, "inner", state).failed)
     assert not bool(getattr(fine := jax.jit(env.step)(env.reset(jax.random.key(0)), jnp.full(4, 9.0)), "inner", fine).failed)
+
+
+@pytest.mark.parametrize(("child", "refused"), [("", True), ('<body pos="0 0 1">{}</body>', False)])
+def test_inertia_of_a_tendon_is_taken_between_joints_with_common_inertia_alone(child, refused):
+    """Two slides of one body share none in MuJoCo C. On a body and its child they do."""
+    second, geom = '<joint name="b" type="slide" axis="1 1 0" stiffness="50"/>', '<geom size="0.1" mass="1" contype="0"/>'
+    inner = geom + child.format(second + geom) if child else second.replace("1 1 0", "0 1 0") + geom
+    xml = f"""<mujoco><option gravity="0 0 0"/><worldbody><body><joint name="a" type="slide" axis="1 0 0"/>{inner}</body>
+</worldbody><tendon><fixed name="t" armature="2"><joint joint="a" coef="1"/><joint joint="b" coef="-1"/></fixed></tendon>
+</mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    if refused:
+        with refuses("armature of tendons", "'t'"):
+            make_engine("jax", model, 1)
+    else:
+        np.testing.assert_allclose(played("jax", model, [1.0, 0.5], 1), played("native", model, [1.0, 0.5], 1), atol=1e-4)

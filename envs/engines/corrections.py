@@ -137,14 +137,14 @@ def implicit(fixed: mujoco.MjModel, alone: np.ndarray, model: mjx.Model, data: m
         args = (blocks, slopes, armature, frames, data.qvel[rows][:, 3:], force[rows])
         shifts = jax.vmap(functools.partial(gyroscopic, float(fixed.opt.timestep)))(*args)
         data = data.replace(qfrc_smooth=data.qfrc_smooth.at[rows].add(shifts))
-    token = _MASK.set(_in_common(fixed))
+    token = _MASK.set(in_common(fixed))
     try:
         return mjx.implicit(model, data)
     finally:
         _MASK.reset(token)
 
 
-def _in_common(model: mujoco.MjModel) -> np.ndarray:
+def in_common(model: mujoco.MjModel) -> np.ndarray:
     """Pairs of degrees of freedom [nv, nv] that have common inertia in MuJoCo C: 1, else 0.
 
     One of them moves the other's body, and they are not two slides or hinges of a body whose inertia is diagonal. Those of a

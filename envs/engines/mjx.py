@@ -23,7 +23,7 @@ from mjx_dher.validation import check_count
 with contextlib.redirect_stdout(io.StringIO()):  # MJX prints a line if warp-lang is not installed
     from mujoco import mjx
 
-    from mjx_dher.envs.engines.corrections import Equality, equalities_of, implicit
+    from mjx_dher.envs.engines.corrections import Equality, equalities_of, implicit, in_common
 
 # Fields of MjModel that MJX 3.17 ignores without an error.
 _IGNORED = (
@@ -38,7 +38,7 @@ def _ignored(model: mujoco.MjModel, sensors: bool) -> Iterator[str]:
     yield from beyond_defaults(model, _IGNORED.__contains__)
     if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER):
         yield "flags that disable springs or dampers"
-    if apart := [i for i in np.flatnonzero(model.tendon_armature).tolist() if not _is_in_one_chain(model, i)]:
+    if apart := [i for i in np.flatnonzero(model.tendon_armature).tolist() if not _has_common_inertia(model, i)]:
         yield with_names("armature of tendons beyond one chain of joints", model, "tendon", apart)
     unseen = np.isin(model.geom_type, (int(mujoco.mjtGeom.mjGEOM_CYLINDER), int(mujoco.mjtGeom.mjGEOM_HFIELD)))
     rays = (model.sensor_type == int(mujoco.mjtSensor.mjSENS_RANGEFINDER)).any()
@@ -50,17 +50,13 @@ def _ignored(model: mujoco.MjModel, sensors: bool) -> Iterator[str]:
     yield from pairs.too_slippery(model, "jax")
 
 
-def _is_in_one_chain(model: mujoco.MjModel, tendon: int) -> bool:
-    """Whether a fixed tendon's joints lie on one path from the world. MuJoCo C leaves out inertia between others."""
+def _has_common_inertia(model: mujoco.MjModel, tendon: int) -> bool:
+    """Whether a tendon is fixed and all its joints have common inertia. MuJoCo C leaves out inertia between others."""
     wraps = model.tendon_adr[tendon] + np.arange(model.tendon_num[tendon])
     if (model.wrap_type[wraps] != int(mujoco.mjtWrap.mjWRAP_JOINT)).any():
         return False
-    dofs, path = model.jnt_dofadr[model.wrap_objid[wraps]], []
-    last = int(dofs.max())
-    while last >= 0:
-        path.append(last)
-        last = int(model.dof_parentid[last])
-    return set(dofs) <= set(path)
+    dofs = model.jnt_dofadr[model.wrap_objid[wraps]]
+    return bool(in_common(model)[np.ix_(dofs, dofs)].all())
 
 
 def with_stand_ins(model: mujoco.MjModel) -> mujoco.MjModel:

@@ -166,7 +166,8 @@ def to_ranges(varied: Mapping[str, Sequence[float]] | str) -> dict[str, tuple[fl
 
 def check_friction(model: mujoco.MjModel, ranges: Mapping[str, tuple[float, float]], engine: str) -> None:
     """Raises ValueError if the lowest friction of `ranges` is too low for an engine."""
-    lowest = Variation(model, list(ranges)).changed(model, np.array([low - 1 for low, _ in ranges.values()]))
+    lows = {name: low for name, (low, _) in ranges.items() if name.startswith("friction:")}
+    lowest = Variation(model, list(lows)).changed(model, np.array([*lows.values()]) - 1)
     for what in too_slippery(lowest, engine):
         cure = 'path="graph" or ' if engine == "warp" and not too_slippery(lowest, "warp graph") else ""
         told = f"engine {engine} does not support {what}, which the lowest factors give"

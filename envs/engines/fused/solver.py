@@ -29,7 +29,7 @@ def _pull(world: World, row: int, residual: float, weight: float) -> float:
 
 @wp.func
 def _times_mass(memory: Memory, row: int, x: Floats, size: int) -> float:
-    """Row of the mass matrix, of which memory holds the lower half, times a vector [size]."""
+    """Row of the mass matrix, whose lower half is in memory, times a vector [size]."""
     sum = float(0.0)
     at = row * (row + 1) // 2
     for i in range(size):
