@@ -64,7 +64,7 @@ PAGES = (
     Page(REPEAT, _REPEATS, DOCS / "bakeoff_repeat_runs.csv", "bakeoff_repeat", pictures=False),
     *(
         Page(PUBLISHED[part], EXPERIMENTS / "as_published.md", DOCS / f"as_published_{part}_runs.csv", part, pictures=False)
-        for part in ("cher", "next_future", "ebp")
+        for part in ("cher", "next_future", "ebp", "test")
     ),
     Page(CONTRASTIVE, EXPERIMENTS / "crl.md", DOCS / "crl_runs.csv", "crl", pictures=False),
     Page(REWARDS, EXPERIMENTS / "crl_rewards.md", DOCS / "crl_rewards_runs.csv", "crl_rewards", pictures=False),
