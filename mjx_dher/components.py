@@ -22,7 +22,8 @@ class Component(NamedTuple):
 _BY_METRIC = ("metric",)
 _WEIGHTED = ("metric", "weight_kernel", "weight_normalization", "temperature", "weight_scale")
 _NOISE = ("noise_std", "random_noise")
-_CRITICS = ("num_critics", "policy_delay", "reset_every")
+_REWARDS = ("hindsight_reward", "polyak")
+_CRITICS = (*_REWARDS, "num_critics", "policy_delay", "reset_every")
 _SMOOTHING = ("target_noise", "target_noise_clip")
 _ENTROPY = ("entropy_weight", "entropy_target")
 _CONTRAST = ("energy", "contrastive_loss", "representation_size", "same_episode", "logsumexp_penalty")
@@ -119,7 +120,9 @@ _TABLE = {
         "hgg": Component("contrib.goals", "achieved goals on the way to the reset's goals (Hindsight Goal Generation)"),
     },
     "learner": {
-        "ddpg": Component("learners.ddpg:make", "DDPG (Lillicrap et al. 2016): deterministic actor, one critic", _NOISE),
+        "ddpg": Component(
+            "learners.ddpg:make", "DDPG (Lillicrap et al. 2016): deterministic actor, one critic", (*_NOISE, *_REWARDS)
+        ),
         "td3": Component(
             "learners.actor_critic",
             "TD3 (Fujimoto et al. 2018): deterministic actor, twin critics, smoothed targets",

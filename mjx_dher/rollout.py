@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_dher import check, context
 from mjx_dher.contract import FLAGS, check_first, check_with_goal, env_spec
-from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, PRNGKey, PyTree, check_size
+from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, PRNGKey, PyTree, check_size, with_key, without_key
 
 # policy(inputs of one step, obs with leading [N]) -> actions [N, A]
 PolicyFn = Callable[[PyTree, GoalObs], Array]
@@ -173,9 +173,8 @@ def where_each(condition: Array, yes: PyTree, no: PyTree) -> PyTree:
     """Selects `yes` or `no` by `condition` [N]; leaves lead with [N]."""
 
     def select(a: Array, b: Array) -> Array:
-        if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
-            return jax.random.wrap_key_data(select(*map(jax.random.key_data, (a, b))), impl=jax.random.key_impl(a))
-        return jnp.where(condition.reshape(-1, *(1,) * (a.ndim - 1)), a, b)
+        old, new = map(without_key, (a, b))
+        return with_key(jnp.where(condition.reshape(-1, *(1,) * (old.ndim - 1)), old, new), a)
 
     return jax.tree.map(select, yes, no)
 
@@ -197,8 +196,8 @@ def _with_goals(env: Any, first: Any, goals: Array) -> Any:
 
 
 def _keys(key: PRNGKey, num_envs: int) -> PRNGKey:
-    """Splits one key, or keeps `num_envs` given ones. A raw key of `jax.random.PRNGKey` is two numbers."""
-    one = 0 if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else 1
-    if key.ndim > one and len(key) != num_envs:
+    """Splits one key, or keeps `num_envs` given ones."""
+    are_many = without_key(key).ndim > 1  # the data of one key are one vector
+    if are_many and len(key) != num_envs:
         raise ValueError(f"key must be one key or [{num_envs}], one for each environment; got [{len(key)}]")
-    return key if key.ndim > one else jax.random.split(key, num_envs)
+    return key if are_many else jax.random.split(key, num_envs)

@@ -113,6 +113,21 @@ class EnvSpec:
         return observation, self.goal_size, self.action_size
 
 
+def is_key(leaf: Any) -> bool:
+    """Whether an array, or its shape, has typed random keys."""
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def without_key(leaf: Any) -> Any:
+    """The array, or the data of its random keys."""
+    return jax.random.key_data(leaf) if is_key(leaf) else leaf
+
+
+def with_key(array: Array, like: Any) -> Array:
+    """Inverse of `without_key` for an array, or its shape, with the dtype of `like`."""
+    return jax.random.wrap_key_data(array, impl=jax.random.key_impl(jnp.empty((), like.dtype))) if is_key(like) else array
+
+
 # Scalars [] by name, for the log.
 Metrics = dict[str, Array]
 

@@ -190,6 +190,7 @@ def test_extremes_of_every_field_are_accepted_or_reported_by_name(value):
         ({"weight_normalization": "none"}, "gamma noise_std", "temperature weight_normalization weight_scale num_critics"),
         ({"weight_normalization": "mine:own"}, "gamma", "weight_scale"),
         ({"learner": "tqc"}, "num_quantiles", "noise_std"),
+        ({"learner": "crl"}, "representation_size", "hindsight_reward polyak num_critics"),
         ({"learner": "mine:learner"}, "noise_std num_quantiles", "temperature"),
     ],
 )

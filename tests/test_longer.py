@@ -12,7 +12,7 @@ from test_driver import result_of, rows_of
 
 import mjx_dher
 from mjx_dher import Options, RunSpec, cli
-from mjx_dher.runs.folder import loggers, run_folder
+from mjx_dher.runs.folder import run_folder, services
 from point_mass import PointMass
 
 FLAGS = [*flags(SHORT), "--final-episodes", "4", "--no-curve"]
@@ -55,7 +55,7 @@ def test_no_more_steps_are_nothing_to_go_on_for(kept, more, capsys):
 
 def test_a_log_that_cannot_start_leaves_a_run_as_it_was(kept, tmp_path, monkeypatch, capsys):
     before = {path: path.read_bytes() for path in kept.rglob("*") if path.is_file()}
-    monkeypatch.setattr(loggers, "TensorBoardSink", Mock(side_effect=ValueError("log tensorboard cannot start")))
+    monkeypatch.setattr(services, "TensorBoardSink", Mock(side_effect=ValueError("log tensorboard cannot start")))
     assert cli.main(["resume", str(kept), "--total-steps", "240", "--log", "tensorboard"]) == 2
     assert "log tensorboard cannot start" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in kept.rglob("*") if path.is_file()} == before

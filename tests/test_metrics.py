@@ -13,7 +13,7 @@ from conftest import refuses
 from mjx_dher import HParams, Options, RunSpec, spec, trainer
 from mjx_dher.context import Context
 from mjx_dher.runs import loop
-from mjx_dher.runs.folder import loggers, results, run_folder
+from mjx_dher.runs.folder import loggers, results, run_folder, services
 from mjx_dher.system import machine
 from mjx_dher.system.files import FolderError
 from point_mass import PointMass
@@ -91,7 +91,7 @@ def events(folder):
 
 
 def test_tensorboard_has_the_metrics_over_environment_steps(tmp_path):
-    write(loggers.TensorBoardSink(tmp_path / "tb"), [1, 2])
+    write(services.TensorBoardSink(tmp_path / "tb"), [1, 2])
     found = events(tmp_path / "tb")
     assert (200, "success_rate", pytest.approx(0.2)) in found
     assert (100, "return_mean", -49.0) in found

@@ -16,7 +16,7 @@ from mjx_dher.learners import Learner
 from mjx_dher.policy import interface_array, read_interface
 from mjx_dher.spec import RunSpec
 from mjx_dher.system.files import atomic_write
-from mjx_dher.types import Array, EnvSpec, PyTree
+from mjx_dher.types import Array, EnvSpec, PyTree, with_key, without_key
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,22 +63,17 @@ class LearnerPolicy:
 
 def _to_plain(leaf: Any) -> np.ndarray:
     """Array of NumPy's own numbers: the data of random keys, and the bits of types that NumPy lacks, such as bfloat16."""
-    array = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+    array = np.asarray(without_key(leaf))
     return array.view(f"u{array.itemsize}") if array.dtype.kind == "V" else array
 
 
 def _from_plain(array: np.ndarray, like: Any) -> Array:
     """Inverse of `_to_plain` for a leaf with the shape and dtype of `like`. Raises ValueError if they do not fit."""
-    numbers = jax.eval_shape(jax.random.key_data, like) if _is_key(like) else like
+    numbers = jax.eval_shape(without_key, like)
     dtype = np.dtype(numbers.dtype)
     if array.shape != numbers.shape or array.dtype != (f"u{dtype.itemsize}" if dtype.kind == "V" else dtype):
         raise ValueError(f"got {array.dtype}{list(array.shape)} for {like.dtype}{list(like.shape)}")
-    value = jnp.asarray(array.view(dtype))
-    return jax.random.wrap_key_data(value, impl=jax.random.key_impl(jnp.empty((), like.dtype))) if _is_key(like) else value
-
-
-def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    return with_key(jnp.asarray(array.view(dtype)), like)
 
 
 def _with_lists(tree: Any, like: PyTree) -> Any:

@@ -20,7 +20,7 @@ from mjx_dher.contract import check_env_parts, env_spec
 from mjx_dher.learners import Learner
 from mjx_dher.replay import ReplayState
 from mjx_dher.rollout import rollout
-from mjx_dher.types import Env, Episode
+from mjx_dher.types import Env, Episode, is_key
 
 EPISODES = 16  # random episodes
 TOLERANCE = 1e-3
@@ -75,7 +75,7 @@ def run(what: str, function: Callable[..., Any], *args: Any) -> Any:
 def expect_same(what: str, result: Any, expected: Any, tolerance: float = TOLERANCE) -> None:
     """Raises ComponentError unless two pytrees of arrays are equal, up to `tolerance` times the larger of 1 and the value."""
     for (path, actual), value in zip(jax.tree_util.tree_leaves_with_path(result), jax.tree.leaves(expected)):
-        if jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+        if is_key(value):
             continue
         a, b = (np.asarray(x, np.float64) for x in (actual, value))
         if not np.allclose(a, b, rtol=tolerance, atol=tolerance, equal_nan=True):

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mjx_dher.runs.folder.fingerprint import sha256_of
 from mjx_dher.runs.folder.run_folder import CHECKPOINTS, MANIFEST, SCHEMA, checkpoints, epoch_of
 from mjx_dher.system import files
 from mjx_dher.system.files import FolderError
+from mjx_dher.types import without_key
 
 STATE_FOLDER = "state"
 _PARTIAL = ".partial-"
@@ -94,7 +94,7 @@ def lack_of_space(folder: Path, state: Any) -> str | None:
 
 def _write(partial: Path, state: Any, content: dict[str, Any]) -> None:
     """Writes a checkpoint's files into the folder `partial`. The manifest has `content` and the digests of all files."""
-    leaves = _to_arrays(state)
+    leaves = {name: np.asarray(array) for name, array in _named(without_keys(state)).items()}
     _write_arrays(partial / STATE_FOLDER, list(leaves.values()))
     content = {
         **content,
@@ -116,28 +116,18 @@ def digest_of(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def is_key(leaf: Any) -> bool:
-    """Whether an array, or its shape, has random keys."""
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
 def _named(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
 
 
-def _to_arrays(state: Any) -> dict[str, np.ndarray]:
-    return {name: np.asarray(jax.random.key_data(x) if is_key(x) else x) for name, x in _named(state).items()}
-
-
 def to_shapes(template: Any) -> dict[str, jax.ShapeDtypeStruct]:
     """Name and shape of each array in a checkpoint, for a state or its shapes."""
-    shape_of = lambda x: jax.eval_shape(jax.random.key_data, x) if is_key(x) else x  # noqa: E731
-    return {name: shape_of(leaf) for name, leaf in _named(template).items()}
+    return _named(jax.eval_shape(without_keys, template))
 
 
 def without_keys(state: Any) -> Any:
     """State with its keys replaced by their data. `save` writes the same for it."""
-    return jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, state)
+    return jax.tree.map(without_key, state)
 
 
 def _write_arrays(path: Path, arrays: list[np.ndarray]) -> None:

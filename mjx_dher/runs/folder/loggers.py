@@ -1,17 +1,15 @@
-"""A run's metrics: failures and warnings that they show, and loggers (CSV, JSON lines, TensorBoard, Weights & Biases)."""
+"""A run's metrics: failures and warnings that they show, and loggers in CSV and JSON lines. `services` has the others."""
 
 import csv
 import io
 import json
 import math
-import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from mjx_dher.config import Config
-from mjx_dher.runs.folder import fingerprint
-from mjx_dher.runs.folder.run_folder import METRICS_FILE, named
+from mjx_dher.runs.folder.run_folder import METRICS_FILE
 from mjx_dher.system import files, machine
 from mjx_dher.system.files import FolderError
 
@@ -102,74 +100,25 @@ def flush_logs(folder: Path) -> None:
     files.flush(folder)
 
 
-class TensorBoardSink:
-    """Event file for TensorBoard in `path`, over environment steps. Needs the extra `tensorboard`."""
+class Sink(Protocol):
+    """A log, with one row per epoch."""
 
-    def __init__(self, path: Path, env_steps: int = 0):
-        from tensorboardX import SummaryWriter
+    def write(self, row: dict[str, Any]) -> None: ...
 
-        self._writer = SummaryWriter(str(path), purge_step=env_steps + 1 if env_steps else None)
-
-    def write(self, row: dict[str, Any]) -> None:
-        for name, value in row.items():
-            if name not in COUNTS:
-                self._writer.add_scalar(name, value, row["env_steps"])
-        self._writer.flush()
-
-    def close(self) -> None:
-        self._writer.close()
-
-
-class WandbSink:
-    """A Weights & Biases run, configured by its environment variables (WANDB_MODE=offline, WANDB_PROJECT, ...). Extra `wandb`.
-
-    The run folder holds offline logs, and a resumed run continues the same W&B run. Raises ValueError if W&B cannot start.
-    """
-
-    def __init__(self, folder: Path):
-        import wandb
-
-        from mjx_dher.runs.folder import reading
-
-        self._folder = folder
-        content = reading.read_config(folder)
-        run = reading.to_spec(folder, content)
-        # A resumed run keeps its id, which therefore excludes settings that may change.
-        described = {name: x for name, x in reading.identity_of(content, run).items() if name not in fingerprint.MAY_CHANGE}
-        try:
-            self._run = wandb.init(
-                project=os.environ.get("WANDB_PROJECT", "mjx-dher"),
-                name=folder.absolute().name,
-                id=fingerprint.sha256_of([folder.absolute().name, described])[:16],
-                resume="allow",
-                dir=folder,
-                config={**fingerprint.settings(run), "seed": run.seed, "engine": content["physics"]},
-                settings=wandb.Settings(silent=True),
-            )
-        except (wandb.Error, ValueError) as error:  # no key, no answer, or a wrong variable
-            reason = "; ".join(map(str.strip, str(error).splitlines()[:3]))
-            raise ValueError(f"log wandb cannot start ({reason}); WANDB_MODE=offline needs no account") from error
-
-    def write(self, row: dict[str, Any]) -> None:
-        with named(self._folder, "log wandb"):
-            self._run.log(row, step=row["epoch"], commit=True)
-
-    def close(self) -> None:
-        with named(self._folder, "log wandb"):
-            self._run.finish()
-
-
-Sink = CsvSink | JsonlSink | TensorBoardSink | WandbSink
+    def close(self) -> None: ...
 
 
 def open_sinks(folder: Path, logs: Sequence[str], epochs: int = 0, env_steps: int = 0, digest: str = "") -> list[Sink]:
     """Opens metrics.csv and `logs` of the run in `folder`, after `epochs` epochs and `env_steps` environment steps."""
-    makers: dict[str, Callable[[], Sink]] = {
-        "jsonl": lambda: JsonlSink(folder / JSON_FILE, epochs),
-        "tensorboard": lambda: TensorBoardSink(folder / "tensorboard", env_steps),
-        "wandb": lambda: WandbSink(folder),
-    }
-    return [CsvSink(folder / METRICS_FILE, epochs, digest), *(makers[log]() for log in dict.fromkeys(logs))]
+    sinks: list[Sink] = [CsvSink(folder / METRICS_FILE, epochs, digest)]
+    for log in dict.fromkeys(logs):
+        if log == "jsonl":
+            sinks.append(JsonlSink(folder / JSON_FILE, epochs))
+        else:
+            from mjx_dher.runs.folder import services
+
+            sinks.append(services.open_sink(log, folder, env_steps))
+    return sinks
 
 
 def metrics_row(progress: Any, metrics: dict[str, float]) -> dict[str, Any]:

@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_dher.runs.folder.checkpoint import STATE_FOLDER, CheckpointError, digest_of, files_of, is_key, to_shapes
+from mjx_dher.runs.folder.checkpoint import STATE_FOLDER, CheckpointError, digest_of, files_of, to_shapes
 from mjx_dher.runs.folder.reading import checked, read_manifest
 from mjx_dher.runs.folder.results import checkpoints_to_resume
 from mjx_dher.runs.folder.run_folder import epoch_of
 from mjx_dher.system.files import FolderError
+from mjx_dher.types import with_key
 
 _HPARAMS = ".hparams."
 _RING, _STEPS = ".replay.", ".env_steps"
@@ -175,7 +176,7 @@ def _place(arrays: Sequence[np.ndarray], template: Any) -> Any:
             value = jnp.array(array)  # a copy, because the next epoch reuses its memory
         else:
             value = jax.make_array_from_callback(array.shape, leaf.sharding, lambda index: array[index])
-        return jax.random.wrap_key_data(value, impl=jax.random.key_impl(jnp.empty((), leaf.dtype))) if is_key(leaf) else value
+        return with_key(value, leaf)
 
     return jax.tree.unflatten(treedef, [put(array, leaf) for array, leaf in zip(arrays, leaves)])
 
