@@ -1,9 +1,11 @@
 """A folder belongs to one program, whatever two programs do."""
 
 import contextlib
+import errno
 import os
 import shutil
 import threading
+from pathlib import Path
 
 import pytest
 from conftest import refuses
@@ -179,6 +181,24 @@ def test_a_damaged_result_is_named_and_the_trial_trained_again(tmp_path):
     assert len(run(tmp_path, trials, report=told.append)) == 1
     assert "result.json" in told[0]
     assert len(tables.read(tmp_path)) == 1
+
+
+def test_a_trial_that_cannot_be_read_is_not_left_out(tmp_path, monkeypatch):
+    cell = tmp_path / "cells" / "run"
+    cell.mkdir(parents=True)
+
+    def unless_cell(read):  # as for users without permission, of whom root is none
+        def guarded(path):
+            if Path(path) == cell:
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+            return read(path)
+
+        return guarded
+
+    for name in ("listdir", "scandir"):
+        monkeypatch.setattr(os, name, unless_cell(getattr(os, name)))
+    with pytest.raises(PermissionError, match="run"):
+        tables.read(tmp_path)
 
 
 def test_files_of_two_runs_are_told_apart(tmp_path):

@@ -25,14 +25,20 @@ def read(folder: Path) -> list[dict[str, Any]]:
     Keys: folder, settings, seed, asked_engine, lanes, status, reason, curve and final. The settings include the engine used
     and `source`: custom source files, JAX flags, and the number of devices if several share the run. The curve has lists
     by column. The last evaluation, final, is empty if the run failed. Raises FolderError if it is not a sweep, no run has
-    ended, a link leads out of the folder, or a trial is invalid (`results.read_trial`).
+    ended, a link leads out of the folder, or a trial is invalid (`results.read_trial`), and OSError if a folder cannot be read.
     """
-    cells = files.inside(folder, [folder / CELLS, *(folder / CELLS).glob("*"), *(folder / CELLS).glob("*/*")])
-    paths = [path.parent for path in cells if path.name == run_folder.RESULT_FILE]
+    cells = _entries(folder / CELLS)
+    inside = files.inside(folder, [folder / CELLS, *cells, *(path for cell in cells for path in _entries(cell))])
+    paths = [path.parent for path in inside if path.name == run_folder.RESULT_FILE]
     if not paths:
         raise FolderError(f"{folder} has no finished run of a sweep")
     trials = [_read_trial(path) for path in paths]
     return sorted(trials, key=lambda t: (t["settings"]["env"], t["settings"]["sampler"], str(t["settings"]), t["seed"]))
+
+
+def _entries(path: Path) -> list[Path]:
+    """Entries of a folder, or none of a file. Raises OSError for a folder that cannot be read, which `glob` takes for empty."""
+    return list(path.iterdir()) if path.is_dir() else []
 
 
 def _read_trial(path: Path) -> dict[str, Any]:
