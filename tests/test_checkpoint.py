@@ -341,6 +341,6 @@ def test_networks_that_are_not_finite_stop_the_run_and_no_policy_is_written(tmp_
     error = refusal(capsys, *TINY, "--total-steps", "300", "--out", tmp_path / "run")
     assert "epoch 1: the networks or normalizers have numbers that are not finite" in error
     assert "there is no checkpoint" in error
-    for command in ("resume", "eval"):
+    for command in ("resume", "eval", "view"):
         assert "it failed in epoch 1: the networks" in refusal(capsys, command, tmp_path / "run")
     assert not (tmp_path / "run" / "policy.npz").exists()

@@ -36,16 +36,8 @@ def load_plain(run_dir: str | Path, use: str) -> Policy:
 def _load(run_dir: str | Path, trust: bool, use: str) -> TrainedPolicy:
     run_dir = bundled.find(run_dir)
     folder = None if run_dir.is_file() else run_dir
-    path = run_dir if folder is None else run_dir / run_folder.POLICY_FILE
     content, spec = reading.read_run(folder, trust) if folder else ({}, None)
-    if not path.is_file():
-        from mjx_dher.runs.folder import results
-
-        if path.exists():
-            raise FolderError(f"{path} is not a file")
-        ended = "the run has ended with a policy, which was removed or not copied" if results.has_result(run_dir) else ""
-        why = results.failure_of(run_dir) or ended or "the run was stopped before its first epoch ended"
-        raise FolderError(f"{path} is missing: {why}")
+    path = policy_file(folder) if folder else run_dir
     with reading.checked(path, "is damaged or not a policy of this program"):
         arrays: dict[str, Any] = npz.read(path, ratio=reading.POLICY_RATIO)
         if spec and (other := reading.foreign(content, spec, reading.policy_settings(arrays))):
@@ -63,6 +55,20 @@ def _load(run_dir: str | Path, trust: bool, use: str) -> TrainedPolicy:
 
     with reading.checked(path, "cannot be played"):
         return from_state(arrays, spec)
+
+
+def policy_file(folder: Path) -> Path:
+    """Path of a run's policy. Raises FolderError, with the reason, if there is none."""
+    path = folder / run_folder.POLICY_FILE
+    if path.is_file():
+        return path
+    from mjx_dher.runs.folder import results
+
+    if path.exists():
+        raise FolderError(f"{path} is not a file")
+    ended = "the run has ended with a policy, which was removed or not copied" if results.has_result(folder) else ""
+    why = results.failure_of(folder) or ended or "no epoch of the run has ended"
+    raise FolderError(f"{path} is missing: {why}")
 
 
 def check_fits(policy: TrainedPolicy, env: Any) -> None:

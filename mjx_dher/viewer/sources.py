@@ -45,8 +45,7 @@ def of_run(label: str, folder: Path, env: str | None = None, env_kwargs: Sequenc
     run = reading.read_spec(folder)
     if env not in (None, run.env) and "hand" == robot(env) == robot(run.env):
         raise ValueError(f"{label} is a policy of {run.env} and cannot be played in {env}, which looks alike")
-    if not (folder / run_folder.POLICY_FILE).is_file():
-        raise FolderError(f"{folder / run_folder.POLICY_FILE} is missing: no epoch of the run has ended yet")
+    load.policy_file(folder)
     arguments = {**(run.env_arguments if env is None else {}), **to_arguments(env_kwargs)}
     return Source(label, env or run.env, folder, run, to_texts(arguments))
 
