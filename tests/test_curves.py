@@ -143,7 +143,9 @@ def test_plot_draws_a_run_into_its_folder_and_several_together(tmp_path, monkeyp
     assert (tmp_path / "curves.png").read_bytes().startswith(PNG)
     assert "seed 1 (not ended)" in capsys.readouterr().out
     assert cli.main(["plot", str(one), str(other), "--formats", "pdf", "--out", "new/folder"]) == 0
-    assert (tmp_path / "new/folder/curves.pdf").read_bytes().startswith(b"%PDF")
+    pdf = (tmp_path / "new/folder/curves.pdf").read_bytes()
+    assert pdf.startswith(b"%PDF")
+    assert b"Date" not in pdf  # equal figures give equal files
 
 
 def test_every_name_of_a_run_is_drawn_as_it_is(tmp_path, monkeypatch, capsys):
@@ -164,7 +166,7 @@ def test_what_is_no_run_is_named(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     for folders, message in (
         ([tmp_path / "none"], "none is neither a run folder nor a sweep: no such folder"),
-        ([tmp_path / "file"], "file is neither a run folder nor a sweep: no such folder"),
+        ([tmp_path / "file"], "file is neither a run folder nor a sweep: it is a file"),
         ([tmp_path], "it has neither config.json nor cells/"),
         ([run, tmp_path / "sweep"], "sweep is a sweep: pass it alone, without other folders"),
         ([tmp_path / "sweep"], "sweep has no finished run of a sweep"),
@@ -244,6 +246,8 @@ def test_a_page_about_a_run_holds_all_that_it_shows(tmp_path, capsys):
     assert cli.main(["report", str(run), "--out", str(tmp_path / "page.html")]) == 2
     assert "exists; pass another file" in capsys.readouterr().err
     assert cli.main(["report", str(run), "--out", str(tmp_path / "page.txt")]) == 2
+    assert cli.main(["report", str(run), "--out", "/proc/page.html", "--video"]) == 2  # before the video
+    assert "out: /proc cannot be written to" in capsys.readouterr().err
 
 
 def test_a_page_about_a_run_that_failed_says_why_without_markup_of_its_own(tmp_path):

@@ -41,9 +41,14 @@ def test_a_python_without_the_originals_is_refused(run, capsys):
     assert "/no/such/python does not have them" in capsys.readouterr().err
 
 
-def test_a_task_without_an_original_is_refused():
+def test_a_task_without_an_original_is_refused_before_the_download(tmp_path, monkeypatch, capsys):
     with refuses("point_mass", "push"):
         transfer.check_original("point_mass", Path(sys.executable))
+    run_folder.write_config(tmp_path, RunSpec(env="arm_reach", engine="native"), "native", {})
+    save_policy(tmp_path)
+    monkeypatch.delattr(transfer, "set_up")
+    assert cli.main(["transfer", str(tmp_path), "--set-up"]) == 2
+    assert "arm_reach has no original" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

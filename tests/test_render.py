@@ -235,6 +235,7 @@ BAD = [  # arguments, and what the message names: the field, the value and what 
     (["--env", "push", "--out", "x.avi"], ["out", "x.avi", ".gif"]),
     (["--env", "push", "--out", "x"], ["out", "x", ".gif"]),
     (["--env", "push", "--out", "nowhere/x.gif"], ["out", "nowhere"]),
+    (["--env", "push", "--out", "/proc/x.gif"], ["out", "/proc cannot be written to"]),  # before it plays
     (["--env", "push", "--out", "docs/push_learning_curve.png"], ["out", "docs/push_learning_curve.png", "--overwrite"]),
     (["--env", "push", *OUT, "--width", "641"], ["width", 641]),
     (["--env", "push", *OUT, "--width", "0", "--height", "9999"], ["width", "height", 9999]),

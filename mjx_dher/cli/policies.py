@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import envs, lookup
-from mjx_dher.cli import PlainConsole, common, parse
+from mjx_dher.cli import PlainConsole, common, parse, settings
 from mjx_dher.cli.common import EnvKwargs, Physics, Trust
 from mjx_dher.lookup import check_name
 from mjx_dher.policy import bundled
@@ -156,6 +156,7 @@ def render_command(argv: list[str], console: Console) -> int:
 
     args = parse(RenderArgs, argv)
     render.check_output(args.out, args.width, args.height, args.overwrite)
+    settings.check_writable(args.out.parent)
     check_play(args.seed, args.engine, args.episodes, args.env_kwargs)
     if args.run is not None and args.env is None:
         folder = find_run(args.run, console)
@@ -236,7 +237,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     from mjx_dher.tools import transfer
 
     policy = load_plain(folder, "transfer")
-    if args.set_up:
+    if args.set_up and run.env in transfer.ORIGINALS:  # otherwise `check_original` raises
         environment = transfer.default_environment()
         console.print(f"the originals' environment is in {environment}; setting it up if necessary ...", soft_wrap=True)
         transfer.set_up(environment)

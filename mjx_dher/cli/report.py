@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console
 
 from mjx_dher import cli
+from mjx_dher.cli import settings
 from mjx_dher.cli.common import Trust, print_table
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.sweeps import grid
@@ -129,13 +130,14 @@ def report_command(argv: list[str], console: Console) -> int:
         files.check_file(args.out, (".html",), args.overwrite)
     from mjx_dher.sweeps import report
 
+    out = args.out or args.folder / report.REPORT
+    settings.check_writable(out.parent)
     if args.video:
         for run, out in _to_film(args.folder, sweep):
             own = ("--out", str(out), "--episodes", str(EPISODES), "--overwrite", *(("--trust",) if args.trust else ()))
             cli.run("render", [str(run), *own], console)
     tell = console.print
     page = report.of_sweep(args.folder, args.baseline, args.threshold, tell) if sweep else report.of_run(args.folder, tell)
-    out = args.out or args.folder / report.REPORT
     with files.atomic_write(out) as partial:
         partial.write_text(page, encoding="utf-8")
     console.print(f"wrote {out}")

@@ -80,7 +80,8 @@ def is_sweep(folders: Sequence[Path]) -> bool:
         raise FolderError("pass one or more run folders, or a sweep; got none")
     for folder in folders:
         if not folder.is_dir():
-            raise FolderError(f"{folder} is neither a run folder nor a sweep: no such folder")
+            told = "it is a file" if folder.exists() else "no such folder"
+            raise FolderError(f"{folder} is neither a run folder nor a sweep: {told}")
         sweep, run = (folder / CELLS).is_dir(), (folder / run_folder.CONFIG_FILE).exists()
         if not sweep and not run:
             told = f"it has neither {run_folder.CONFIG_FILE} nor {CELLS}/"

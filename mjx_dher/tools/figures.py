@@ -86,8 +86,9 @@ def write(figure: Any, path: Path) -> None:
     import matplotlib
 
     ending = path.suffix[1:]
+    dates = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     with files.atomic_write(path) as partial, matplotlib.rc_context({"svg.hashsalt": "mjx-dher"}):
-        figure.savefig(partial, format=ending, dpi=DPI, metadata={"Date": None} if ending == "svg" else None)
+        figure.savefig(partial, format=ending, dpi=DPI, metadata=dates.get(ending))
 
 
 def to_svg(figure: Any, number: int) -> str:
