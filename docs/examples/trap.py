@@ -52,8 +52,8 @@ class Trap:
     def reset(self, key):
         """Draws start and goal at random angles and distances around the trap."""
         angle_key, radius_key = jax.random.split(key)
-        angle = jax.random.uniform(angle_key, (2,), maxval=2 * jnp.pi)
-        radius = jax.random.uniform(radius_key, (2,), minval=0.3, maxval=0.4)
+        angle = jax.random.uniform(angle_key, (2,), jnp.float32, maxval=2 * jnp.pi)
+        radius = jax.random.uniform(radius_key, (2,), jnp.float32, minval=0.3, maxval=0.4)
         start, goal = radius[:, None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
         return self._state(start, goal)
 
