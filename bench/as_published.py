@@ -12,6 +12,7 @@ tune_runs.csv; its copy docs/as_published_tune_runs.csv is what `test` reads.
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import functools
 import sys
@@ -139,11 +140,9 @@ EXPERIMENTS = {
 
 def main() -> int:
     """Runs the experiment that the first argument names, with bench/bakeoff.py's options after it."""
-    name = sys.argv[1] if len(sys.argv) > 1 else ""
-    if name not in EXPERIMENTS:
-        print(f"{__doc__}\nthe first argument must be one of {', '.join(EXPERIMENTS)}; got {name!r}", file=sys.stderr)
-        return 2
-    return bakeoff.main(sys.argv[2:], EXPERIMENTS[name], __doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("experiment", choices=EXPERIMENTS)
+    return bakeoff.main(sys.argv[2:], EXPERIMENTS[parser.parse_args(sys.argv[1:2]).experiment], __doc__)
 
 
 if __name__ == "__main__":

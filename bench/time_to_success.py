@@ -10,7 +10,6 @@ or above the threshold. The final success is over 500 fresh episodes.
 from __future__ import annotations
 
 import argparse
-import csv
 import dataclasses
 import statistics
 import time
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from bakeoff_runs import save
 from timing import print_table
 
 from mjx_dher import HParams, envs, learners, presets, priorities, samplers, stats
@@ -38,6 +38,10 @@ def main() -> None:
     parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="changes to the preset")
     parser.add_argument("--out", type=Path, help="CSV of every evaluation of every seed")
     args = parser.parse_args()
+    if args.seeds < 1:
+        parser.error(f"--seeds is 1 or more; got {args.seeds}")
+    if args.out and not args.out.resolve().parent.is_dir():
+        parser.error(f"--out: there is no folder {args.out.parent}")
     spec = presets.preset(args.preset, args.env)
     config, hparams = spec.config, spec.hparams
     for name, _, value in (change.partition("=") for change in args.set):
@@ -72,9 +76,8 @@ def main() -> None:
         )
         rows.append((seed, *reached, *total, *final))
         print(rows[-1], flush=True)
-    if args.out:
-        with args.out.open("w", newline="") as file:
-            csv.writer(file).writerows([("seed", "env_steps", "updates", "wall_seconds", "success_rate"), *curve])
+        if args.out:
+            save(args.out, curve, ("seed", "env_steps", "updates", "wall_seconds", "success_rate"))
     head = (
         f"s to {args.threshold}",
         "env steps",

@@ -2,9 +2,11 @@
 
 import csv
 import dataclasses
+import sys
 
 import make_comparison_tables
 import numpy as np
+import pytest
 from conftest import ROOT, refuses
 
 from mjx_dher.spec import validate
@@ -154,3 +156,15 @@ def test_curves_of_both_are_compared_over_the_steps_that_both_have(monkeypatch, 
     half = 4.302653 * (2 * 0.005 / 2) ** 0.5
     assert ours == f"| `arm_reach` | ours | 2 | 0.425 | 0.550 | +0.375 | {0.375 - half:+.3f} to {0.375 + half:+.3f} |"
     assert theirs == "| `arm_reach` | theirs | 2 | 0.050 | 0.050 |  |  |"
+
+
+@pytest.mark.parametrize(("argv", "status"), [(["--help"], 0), ([], 2), (["chr"], 2)])
+def test_the_first_argument_is_an_experiment(argv, status, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(ROOT / "bench")
+    import as_published
+
+    monkeypatch.setattr(sys, "argv", ["as_published.py", *argv])
+    with pytest.raises(SystemExit) as ended:
+        as_published.main()
+    assert ended.value.code == status
+    assert "next_future" in "".join(capsys.readouterr())

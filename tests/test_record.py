@@ -4,6 +4,7 @@ import datetime
 import json
 import sys
 
+import pytest
 from conftest import ROOT, refuses
 
 sys.path.insert(0, str(ROOT / "bench"))
@@ -75,3 +76,15 @@ def test_a_busy_machine_and_changes_are_refused(tmp_path, monkeypatch):
     assert first["remarks"] == ["machine busy"]
     assert first["figures"] == dict.fromkeys(record.FIGURES, 0.6667)
     assert len(second["commit"]) >= 12
+
+
+@pytest.mark.parametrize("argv", [["--seeds", "0"], ["--out", "nowhere/curve.csv"]])
+def test_a_time_to_success_that_would_be_lost_is_refused_before_it_trains(argv, monkeypatch, capsys):
+    import time_to_success
+
+    monkeypatch.setattr(time_to_success, "train", None)
+    monkeypatch.setattr(sys, "argv", ["time_to_success.py", *argv])
+    with pytest.raises(SystemExit) as ended:
+        time_to_success.main()
+    assert ended.value.code == 2
+    assert argv[0] in capsys.readouterr().err.splitlines()[-1]
