@@ -111,7 +111,7 @@ class Runs:
 
 def digest(state):
     found = hashlib.sha256()
-    for array in checkpoint._to_arrays(state).values():
+    for array in jax.tree.leaves(checkpoint.without_keys(state)):
         found.update(np.ascontiguousarray(array).tobytes())
     return found.hexdigest()
 
