@@ -330,7 +330,7 @@ def test_what_does_not_combine_is_refused_by_name():
 
 def test_resets_draw_new_networks_when_they_are_due_and_keep_the_normalizers():
     learner = learners.make("sac", dataclasses.replace(SMALL, hidden_sizes=(4,), reset_every=40), SPEC)
-    state, obs, goal = learner.init(jax.random.key(0)), jnp.ones((3, 2, 2)), jnp.ones((5, 2))
+    state, obs, goal = jax.jit(learner.init)(jax.random.key(0)), jnp.ones((3, 2, 2)), jnp.ones((5, 2))
     kernel = lambda state: state.params.critic["params"]["Dense_0"]["kernel"]  # noqa: E731
     reset = jax.jit(lambda state: learner.update_normalizers(state, obs, goal, HP, jnp.ones(3, bool)))
     after = {n: reset(dataclasses.replace(state, num_updates=jnp.int32(n))) for n in (0, 20, 40, 80)}

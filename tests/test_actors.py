@@ -57,7 +57,8 @@ def draw(params, number, size=2):
 
 def test_a_target_s_actions_are_smoothed_within_bounds():
     actions = jnp.tile(jnp.array([[0.0, 0.95]]), (20_000, 1))
-    smoothed, cost = Deterministic().next_action(Straight(), {}, actions, zeros(20_000, 1), normal(20_000, 2), HP)
+    smooth = jax.jit(lambda: Deterministic().next_action(Straight(), {}, actions, zeros(20_000, 1), normal(20_000, 2), HP))
+    smoothed, cost = jax.device_get(smooth())
     assert not cost.any()
     noise = np.asarray(smoothed[:, 0])
     assert np.abs(noise).max() == pytest.approx(0.2)
@@ -106,8 +107,9 @@ def test_far_out_log_probabilities_stay_finite():
 
 def test_a_gaussian_actor_s_target_costs_alpha_log_pi():
     params = gaussian(0.3, 0.5, log_alpha=np.log(4.0))
-    action, cost = Gaussian().next_action(Fixed(), params, zeros(16, 2), zeros(16, 1), normal(16, 2), HP)
-    drawn, log_prob = draw(params, 16)
+    judged = lambda params: Gaussian().next_action(Fixed(), params, zeros(16, 2), zeros(16, 1), normal(16, 2), HP)  # noqa: E731
+    action, cost = jax.jit(judged)(params)
+    drawn, log_prob = jax.device_get(draw(params, 16))
     np.testing.assert_allclose(action, drawn, rtol=1e-6)
     np.testing.assert_allclose(cost, 0.5 * 4.0 * log_prob, rtol=1e-6)
 
@@ -115,10 +117,9 @@ def test_a_gaussian_actor_s_target_costs_alpha_log_pi():
 def test_a_gaussian_actor_s_loss_by_hand():
     params, judge = gaussian(0.3, 0.5, log_alpha=np.log(4.0)), lambda action: 3.0 * action[:, 0]
     arguments = zeros(16, 2), zeros(16, 1)
-    (loss, metrics), gradient = jax.value_and_grad(
-        lambda params: Gaussian().loss(Fixed(), params, *arguments, judge, normal(16, 2), HP), has_aux=True
-    )(params)
-    action, log_prob = draw(params, 16)
+    loss_of = lambda params: Gaussian().loss(Fixed(), params, *arguments, judge, normal(16, 2), HP)  # noqa: E731
+    (loss, metrics), gradient = jax.jit(jax.value_and_grad(loss_of, has_aux=True))(params)
+    action, log_prob = jax.device_get(draw(params, 16))
     target = -2.0 * 2  # entropy_target for each of two numbers
     expected = (2.0 * log_prob - 3.0 * action[:, 0]).mean() - np.log(4.0) * (log_prob.mean() + target)
     np.testing.assert_allclose(loss, expected, rtol=1e-5)
@@ -129,17 +130,17 @@ def test_a_gaussian_actor_s_loss_by_hand():
 @pytest.mark.parametrize(("std", "sign"), [(0.01, -1), (1.0, 1)])
 def test_the_weight_of_entropy_rises_where_there_is_too_little(std, sign):
     """Gradient descent raises log_alpha where its gradient is below 0: at entropies under the target."""
-    gradient = jax.grad(
-        lambda params: Gaussian().loss(Fixed(), params, zeros(99, 2), zeros(99, 1), lambda a: a[:, 0], normal(99, 2), HP)[0]
-    )(gaussian(0.0, std))
+    arguments = zeros(99, 2), zeros(99, 1), lambda a: a[:, 0], normal(99, 2), HP
+    gradient = jax.jit(jax.grad(lambda params: Gaussian().loss(Fixed(), params, *arguments)[0]))(gaussian(0.0, std))
     assert np.sign(gradient["log_alpha"]) == sign
 
 
 def test_exploring_draws_from_the_policy_or_uniformly():
     params = gaussian(0.2, 0.5)
-    noise = Gaussian().noise(KEY, 200, 50, 2, HP._replace(random_eps=0.25, noise_std=9.0))
-    actions = jax.vmap(lambda n: Gaussian().explore(Fixed(), params, zeros(50, 2), zeros(50, 1), n))(noise)
-    own = np.asarray(actions)[~np.asarray(noise.is_random)]
+    noise = jax.jit(lambda: Gaussian().noise(KEY, 200, 50, 2, HP._replace(random_eps=0.25, noise_std=9.0)))()
+    explore = jax.vmap(lambda n: Gaussian().explore(Fixed(), params, zeros(50, 2), zeros(50, 1), n))
+    actions, noise = jax.device_get((jax.jit(explore)(noise), noise))
+    own = actions[~noise.is_random]
     u = np.arctanh(own.astype(np.float64))
     assert abs(u.mean() - 0.2) < 0.02
     assert abs(u.std() - 0.5) < 0.02  # noise_std plays no part
@@ -149,14 +150,18 @@ def test_exploring_draws_from_the_policy_or_uniformly():
 
 
 def test_exploring_without_a_distribution_adds_noise():
-    noise = Deterministic().noise(KEY, 100, 50, 2, HP._replace(random_eps=0.0, noise_std=0.1))
-    actions = jax.vmap(lambda n: Deterministic().explore(Straight(), {}, zeros(50, 2), zeros(50, 1), n))(noise)
-    assert abs(float(actions.std()) - 0.1) < 0.005
+    actor = Deterministic()
+
+    def explore():
+        noise = actor.noise(KEY, 100, 50, 2, HP._replace(random_eps=0.0, noise_std=0.1))
+        return jax.vmap(lambda n: actor.explore(Straight(), {}, zeros(50, 2), zeros(50, 1), n))(noise)
+
+    assert abs(np.std(jax.jit(explore)()) - 0.1) < 0.005
 
 
 def test_layers_for_export_are_those_of_the_means():
     inputs, network = (jnp.zeros(5), jnp.zeros(3)), GaussianActor(2, (8,))
-    params = Gaussian().init(network, KEY, *inputs)
+    params = jax.jit(lambda: Gaussian().init(network, KEY, *inputs))()
     layers = Gaussian().dense(network, params)
     assert layers["Dense_1"]["kernel"].shape == (8, 2)
     mean, _ = network.apply(params["network"], jnp.ones(5), jnp.ones(3))

@@ -30,8 +30,9 @@ def test_a_simulated_marker_of_the_goal_changes_nothing(push):
     assert models[1].nv == models[0].nv + 6
     rng, nq, touched = np.random.default_rng(0), models[0].nq, 0
     plain.qpos[:] = marked.qpos[:nq] = models[0].key_qpos[0]
+    controls = jax.jit(lambda action: push.controls(jax.tree.map(jnp.asarray, push._rest), action).ctrl)
     for _ in range(30):
-        ctrl = push.controls(jax.tree.map(jnp.asarray, push._rest), jnp.asarray(rng.uniform(-1, 1, 5), jnp.float32)).ctrl
+        ctrl = controls(rng.uniform(-1, 1, 5).astype(np.float32))
         for model, data in zip(models, (plain, marked)):
             data.ctrl[:] = ctrl
             mujoco.mj_step(model, data, nstep=25)
@@ -57,7 +58,7 @@ def test_the_arm_at_rest_is_near_half_of_the_goals_of_arm_reach():
     share = env.model.actuator_gainprm[:, 0] / -env.model.actuator_biasprm[:, 1]
     np.testing.assert_allclose(share[[0, 1, 3, 5]], [1, 1, 4 / 7, 1 / 2])
     start, actions = jax.tree.map(jnp.asarray, env._rest), rng.uniform(-1, 1, (40_000, 4)).astype(np.float32)
-    inputs = np.asarray(jax.vmap(lambda action: env.controls(start, action).ctrl)(actions))
+    inputs = np.asarray(jax.jit(jax.vmap(lambda action: env.controls(start, action).ctrl))(actions))
     data, ends = mujoco.MjData(env.model), []
     for ctrl in inputs:
         data.qpos[:] = share * ctrl
@@ -100,19 +101,19 @@ def test_the_last_observations_are_the_fingers_distance_and_the_servos_forces(na
 
 def test_the_cube_is_gripped_if_the_fingertips_are_around_it():
     goal = arms.Gripped()
-    wanted = jnp.asarray(goal.wanted)
-    shifted = wanted.at[jnp.array([1, 4])].add(0.04)  # both tips by 4 cm: so is their middle
-    apart = wanted.at[0].add(0.03).at[3].add(-0.03)  # away from each other: the middle stays
-    wide = wanted.at[6].add(0.03)
-    np.testing.assert_allclose(
-        goal.distance(jnp.stack([wanted, shifted, apart, wide]), wanted), [0.0, 0.8, 0.0, 1.5], atol=1e-6
-    )
+    wanted = np.asarray(goal.wanted, np.float32)
+    shifted, apart, wide = wanted.copy(), wanted.copy(), wanted.copy()
+    shifted[[1, 4]] += 0.04  # both tips by 4 cm: so is their middle
+    apart[[0, 3]] += [0.03, -0.03]  # away from each other: the middle stays
+    wide[6] += 0.03
+    distances = jax.jit(goal.distance)(np.stack([wanted, shifted, apart, wide]), wanted)
+    np.testing.assert_allclose(distances, [0.0, 0.8, 0.0, 1.5], atol=1e-6)
 
 
 def test_the_arm_moves_as_in_jaxgcrl():
     """One action from the start; MJX's numbers, of JaxGCRL's model and settings (JaxGCRL 0.2.8, Brax 0.14.2, MuJoCo 3.17.0)."""
     env = envs.make("arm_reach", engine="native")
-    state = jax.jit(env.step)(env.reset(jax.random.key(0)), jnp.array([0.5, -0.5, 0.3, 0.2]))
+    state = jax.jit(env.step)(jax.jit(env.reset)(jax.random.key(0)), jnp.array([0.5, -0.5, 0.3, 0.2]))
     expected = [1.6079, 0.746, -0.0046, -1.503, 0.0004, 3.0013, 1.4116]
     np.testing.assert_allclose(state.physics.qpos, expected, atol=1e-4)
     np.testing.assert_allclose(state.physics.qvel, [1.3563, 0.1707, -0.0732, 2.627, 0.0069, -2.0323, -1.4378], atol=1e-3)

@@ -76,10 +76,10 @@ def pairs(action, goal, row=None):
 
 
 def test_other_goals_of_an_episode_are_left_out_if_masked():
-    state = made(ONE).init(KEY)
+    state = jax.jit(made(ONE).init)(KEY)
     batch = pairs(jnp.array([[0.1], [0.2], [0.3]]), jnp.array([[1.0], [2.0], [3.0]]), jnp.array([5, 7, 5]))
     inputs = state.params.critic, batch.observation, batch.desired_goal, batch
-    whole, masked = made(ONE).logits(*inputs), made(ONE, same_episode="masked").logits(*inputs)
+    whole, masked = (jax.jit(learner.logits)(*inputs) for learner in (made(ONE), made(ONE, same_episode="masked")))
     assert np.all(np.isfinite(whole))
     np.testing.assert_array_equal(np.isinf(masked), [[0, 0, 1], [0, 0, 0], [1, 0, 0]])
     np.testing.assert_array_equal(np.where(np.isinf(masked), whole, masked), whole)
@@ -98,10 +98,10 @@ def test_the_critic_learns_how_much_likelier_an_action_makes_a_goal_and_the_acto
         return learner.update(state, pairs(action, goal), hparams)
 
     state, metrics = jax.jit(lambda state, keys: jax.lax.scan(step, state, keys))(
-        learner.init(KEY), jax.random.split(jax.random.key(1), 400)
+        jax.jit(learner.init)(KEY), jax.random.split(jax.random.key(1), 400)
     )
     signs = jnp.array([[1.0], [-1.0]])
-    logits = learner.logits(state.params.critic, jnp.ones((2, 1)), signs, pairs(signs, signs))
+    logits = np.asarray(jax.jit(learner.logits)(state.params.critic, jnp.ones((2, 1)), signs, pairs(signs, signs)))
     np.testing.assert_allclose([logits[0, 0] - logits[0, 1], logits[1, 1] - logits[1, 0]], np.log(4), atol=0.3)
     # What remains of the loss is log B less the mutual information, log 2 less the entropy of (0.8, 0.2).
     information = np.log(2) + 0.8 * np.log(0.8) + 0.2 * np.log(0.2)
@@ -205,7 +205,7 @@ def test_what_does_not_combine_is_rejected():
 def test_residual_networks_by_hand():
     """Four layers: the first, a pair with a skip connection around it, and one more; swish after layer normalization."""
     network = Encoders((4,) * 4, jnp.float32, 3, Style(layer_norm=True, residual=True))
-    params = network.init(KEY, *(jnp.zeros(2) for _ in range(3)))
+    params = jax.jit(network.init)(KEY, *(jnp.zeros(2) for _ in range(3)))
     inputs = [jax.random.normal(jax.random.key(i), (5, 2)) for i in range(3)]
     layers = jax.tree.map(np.asarray, params["params"]["psi"])
 
@@ -218,8 +218,8 @@ def test_residual_networks_by_hand():
     first = layer(np.asarray(inputs[1]), 0)
     second = layer(layer(first, 1), 2) + first
     expected = layer(second, 3) @ layers["Dense_4"]["kernel"] + layers["Dense_4"]["bias"]
-    np.testing.assert_allclose(network.apply(params, *inputs)[1], expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(network.apply)(params, *inputs)[1], expected, rtol=1e-4, atol=1e-5)
     with refuses("hidden_sizes", (8, 4)):
         networks.residual(2, (8, 4))
     learner = made(network="residual")
-    assert learner.export(learner.init(KEY), HParams()) is None  # a Policy has neither swish nor normalization
+    assert learner.export(jax.jit(learner.init)(KEY), HParams()) is None  # a Policy has neither swish nor normalization

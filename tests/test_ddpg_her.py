@@ -43,10 +43,10 @@ class Line:
 
 def test_transitions_and_their_goals():
     """Goal and observation t of episode e are 10 e + t, its desired goal is 900 + e. Two of the three rows are written."""
-    goals = 10.0 * jnp.arange(3)[:, None, None] + jnp.arange(6.0)[None, :, None]
-    episodes = ddpg_her.Episodes(goals, goals, 900.0 + jnp.arange(3.0)[:, None], goals[:, :-1])
+    goals = np.float32(10 * np.arange(3)[:, None, None] + np.arange(6)[None, :, None])
+    episodes = ddpg_her.Episodes(goals, goals, np.float32(900 + np.arange(3)[:, None]), goals[:, :-1])
     static = ddpg_her.Static(Line(), SETTINGS._replace(her_k=3.0), None, None)
-    batch = ddpg_her.draw_batch(static, episodes, 2, jax.random.key(0), 4000)
+    batch = jax.jit(lambda episodes: ddpg_her.draw_batch(static, episodes, 2, jax.random.key(0), 4000))(episodes)
     start, end, goal = (np.ravel(x) for x in (batch.observation, batch.next_observation, batch.goal))
     row, hindsight = start // 10, goal < 900
     np.testing.assert_array_equal(end, start + 1)

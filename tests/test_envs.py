@@ -40,9 +40,9 @@ def test_observation_is_the_original_s_as_a_function_of_the_state(task):
     qvel = recorded["object_qvel"][:, 1::7].reshape(-1, 6)
     want = recorded["observation"][:, 1::7].reshape(-1, 25)
     if task == "pick_and_place":  # seen one substep late
-        qpos = np.asarray(jax.vmap(lambda q, v: arm_kinematics.integrate(q, v, -fetch.TIMESTEP))(qpos, qvel))
+        qpos = np.asarray(jax.jit(jax.vmap(lambda q, v: arm_kinematics.integrate(q, v, -fetch.TIMESTEP)))(qpos, qvel))
     args = (want[:, :3], want[:, 20:23] / dt, qpos, qvel, want[:, 9:11], want[:, 23:25] / dt)
-    got = np.array(jax.vmap(fetch.fetch_observation)(*args))
+    got = np.array(jax.jit(jax.vmap(fetch.fetch_observation))(*args))
     got[:, 11:14] -= np.round((got[:, 11:14] - want[:, 11:14]) / (2 * np.pi)) * 2 * np.pi  # +-pi is one angle
     # Recorded in float32; near a pitch of 90 degrees, Euler angles amplify its rounding.
     steady = np.abs(np.abs(want[:, 12]) - np.pi / 2) > 0.05

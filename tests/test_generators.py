@@ -49,9 +49,8 @@ def test_a_rollout_takes_keys_of_either_kind():
 
 def test_a_rollout_is_played_for_the_goals_that_are_given():
     actions = jnp.zeros((ENV.episode_length, 5, 2))
-    episodes, outcome = rollout(
-        ENV, lambda action, obs: action, jax.random.key(0), 5, actions, lambda obs: corner(0, obs, 0, 0)
-    )
+    play = lambda: rollout(ENV, lambda action, obs: action, jax.random.key(0), 5, actions, lambda obs: corner(0, obs, 0, 0))  # noqa: E731
+    episodes, outcome = jax.jit(play)()
     np.testing.assert_allclose(episodes.desired_goal, 0.3)
     np.testing.assert_allclose(episodes.achieved_goal[:, 0], first_of().obs["achieved_goal"])
     assert outcome.valid.all()

@@ -99,7 +99,8 @@ def test_the_faces_of_a_cube_are_24():
 
 @pytest.mark.parametrize("kind", hand.ROTATIONS)
 def test_rotations_are_drawn_as_in_the_original(kind):
-    quats = np.array(jax.vmap(lambda key: hand.draw_rotation(key, kind))(jax.random.split(jax.random.key(0), 2000)))
+    draw = jax.jit(jax.vmap(lambda key: hand.draw_rotation(key, kind)))
+    quats = np.array(draw(jax.random.split(jax.random.key(0), 2000)))
     np.testing.assert_allclose(np.linalg.norm(quats, axis=1), 1, atol=1e-6)
     if kind == "parallel":
         faces = Rotation.from_quat(quats, scalar_first=True).as_matrix()[:, 2]

@@ -85,7 +85,7 @@ def test_the_default_is_ddpg_with_the_paper_s_networks():
 @pytest.mark.parametrize("name", ["ddpg", "tqc"])
 def test_values_are_of_the_learner_s_type_and_actions_are_not(name):
     learner = learners.make(name, dataclasses.replace(SMALL, learner_dtype="bfloat16"), TASK)
-    state, goal = learner.init(jax.random.key(0)), jnp.ones((3, 2))
+    state, goal = jax.jit(learner.init)(jax.random.key(0)), jnp.ones((3, 2))
     obs = {"observation": jnp.ones((3, 2)), "achieved_goal": goal, "desired_goal": goal}
     programs = jax.make_jaxpr(learner.value)(state, obs, goal, HP), jax.make_jaxpr(learner.act)(state, obs, HP)
     assert ["bf16" in str(program) for program in programs] == [True, False]

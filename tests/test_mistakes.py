@@ -274,13 +274,17 @@ def ring(episodes):
     return replay.add(replay.init(jax.tree.map(lambda x: x[0], episodes), 8), episodes)
 
 
+draw, relabelled = jax.jit(replay.sample, static_argnums=2), jax.jit(relabel.relabel, static_argnums=(1, 2))
+
+
 def test_transitions_without_a_goal_keep_their_own_and_are_counted(ring):
-    sample = replay.sample(ring, jax.random.key(2), 400)
+    sample = draw(ring, jax.random.key(2), 400)
     for sampler in (mistakes.nothing, mistakes.infinite, mistakes.nan_late, within):
         context = Context(ENV.compute_reward, HParams(her_k=1e9))
-        made = jax.jit(relabel.relabel, static_argnums=(1, 2))(sample, sampler, context, jax.random.key(3))
-        log_weights = jax.vmap(sampler, (0, 0, 0, None))(sample.episode_goals, sample.desired_goal, sample.step, HParams())
-        offered = np.asarray(jnp.isfinite(jnp.max(log_weights, axis=1)))
+        made = relabelled(sample, sampler, context, jax.random.key(3))
+        weigh = jax.jit(jax.vmap(sampler, (0, 0, 0, None)))
+        log_weights = weigh(sample.episode_goals, sample.desired_goal, sample.step, HParams())
+        offered = np.isfinite(np.max(log_weights, axis=1))
         kept = np.all(np.asarray(made.batch.desired_goal) == np.asarray(sample.desired_goal), axis=1)
         assert np.all(kept[~offered])
         assert made.no_goal_share == pytest.approx(1 - offered.mean())
@@ -289,9 +293,9 @@ def test_transitions_without_a_goal_keep_their_own_and_are_counted(ring):
 
 
 def test_a_plain_function_is_a_sampler(ring):
-    sample = replay.sample(ring, jax.random.key(2), 50)
+    sample = draw(ring, jax.random.key(2), 50)
     plain, named = (
-        relabel.relabel(sample, sampler, Context(ENV.compute_reward, HParams()), jax.random.key(3)).batch
+        relabelled(sample, sampler, Context(ENV.compute_reward, HParams()), jax.random.key(3)).batch
         for sampler in (samplers.future, samplers.make("future"))
     )
     np.testing.assert_array_equal(plain.desired_goal, named.desired_goal)
@@ -302,10 +306,10 @@ def test_a_plain_function_is_a_sampler(ring):
 
 
 def test_relabel_takes_rewards_of_one_axis(ring):
-    sample = replay.sample(ring, jax.random.key(2), 5)
+    sample = draw(ring, jax.random.key(2), 5)
     for reward in (lambda a, d: ENV.compute_reward(a, d)[:, None], lambda a, d: jnp.zeros(())):
         with refuses("compute_reward", "[5]"):
-            relabel.relabel(sample, samplers.future, Context(reward, HParams()), jax.random.key(3))
+            relabelled(sample, samplers.future, Context(reward, HParams()), jax.random.key(3))
 
 
 def test_what_the_ring_has_no_place_for_is_named(ring, episodes):

@@ -67,13 +67,13 @@ def test_only_valid_values_are_seen():
 
 def test_a_tree_is_normalized_leaf_by_leaf():
     """Each float leaf has the moments that it would have alone, whatever its shape; other leaves pass through."""
-    key = jax.random.key(0)
+    random = np.random.default_rng(0)
     values = {
-        "vector": jax.random.normal(key, (4, 5, 3)),
-        "image": jnp.ones((4, 5, 2, 2, 1), jnp.uint8),
-        "field": [jax.random.normal(key, (4, 5, 2, 2)), jnp.ones((4, 5))],
+        "vector": random.normal(size=(4, 5, 3)).astype(np.float32),
+        "image": np.ones((4, 5, 2, 2, 1), np.uint8),
+        "field": [random.normal(size=(4, 5, 2, 2)).astype(np.float32), np.ones((4, 5), np.float32)],
     }
-    valid = jnp.arange(20).reshape(4, 5) % 3 > 0
+    valid = np.arange(20).reshape(4, 5) % 3 > 0
     state = normalizer.init(jax.tree.map(lambda x: x[0, 0], values))
     state = update(state, values, 200.0, valid)
     assert state["image"] is None
@@ -83,8 +83,9 @@ def test_a_tree_is_normalized_leaf_by_leaf():
         np.testing.assert_allclose(moments.var.reshape(-1), flat.var(0), rtol=1e-5)
     rows = update(normalizer.init(jnp.zeros(3)), values["vector"], 200.0, jnp.array([True, False, True, True]))
     assert float(rows.count) == 15
-    result = normalizer.normalize(state, values, 0.01, 5.0, 200.0)
+    normalize = jax.jit(normalizer.normalize)
+    result = normalize(state, values, 0.01, 5.0, 200.0)
     assert result["image"].dtype == jnp.uint8
-    alone = normalizer.normalize(state["vector"], values["vector"], 0.01, 5.0, 200.0)
+    alone = normalize(state["vector"], values["vector"], 0.01, 5.0, 200.0)
     np.testing.assert_array_equal(result["vector"], alone)
-    assert abs(float(jnp.mean(result["field"][0][valid]))) < 1e-6
+    assert abs(np.mean(np.asarray(result["field"][0])[valid])) < 1e-6

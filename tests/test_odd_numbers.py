@@ -41,9 +41,13 @@ def both_ways(function):
 
 
 def assert_the_same_both_ways(function):
-    for (name, own), (_, other) in both_ways(function):
+    """Of a whole program each. Returns the result of the second."""
+    results = []
+    program = lambda: results.append(jax.device_get(jax.jit(function)())) or results[-1]  # noqa: E731
+    for (name, own), (_, other) in both_ways(program):
         assert own.dtype == other.dtype, name
         np.testing.assert_array_equal(own, other, str(name))
+    return results[-1]
 
 
 def ring_of(ends):
@@ -64,16 +68,14 @@ def test_the_ring_draws_the_same_rows_and_steps_with_64_bits(ends):
         ring, key = ring_of(ends), jax.random.key(1)
         weights = replay.cumulative(ring)
         one = replay.sample(ring, key, 3000)
-        assert np.unique(one.row).tolist() == list(range(12))
-        assert np.unique(one.step).tolist() == list(range(10))
-        assert np.all(np.asarray(one.step) < np.asarray(one.length))
         rows = replay.draw_rows(ring, key, 3000, 0.5, weights)
-        assert np.unique(rows).tolist() == list(range(12))
-        others = replay.newest_and_others(ring, key, 3, 500)
-        assert np.unique(others).tolist() == list(range(12))
-        return weights, one, rows, others, replay.sample_pool(ring, key, 3000)
+        return weights, one, rows, replay.newest_and_others(ring, key, 3, 500), replay.sample_pool(ring, key, 3000)
 
-    assert_the_same_both_ways(draw)
+    _, one, rows, others, _ = assert_the_same_both_ways(draw)
+    for found in (one.row, rows, others):
+        assert np.unique(found).tolist() == list(range(12))
+    assert np.unique(one.step).tolist() == list(range(10))
+    assert np.all(one.step < one.length)
 
 
 @pytest.mark.parametrize("sampler", ["episode", "random", "future", "final", "geometric", "epsilon_closest", "weighted"])
@@ -138,11 +140,11 @@ class KeyedWalk(Walk):
 
 def test_states_may_have_keys_of_another_generator():
     keys, others = keys_of(4), keys_of(8)[4:]
-    mixed = where_each(jnp.array([True, False, True, False]), keys, others)
+    mixed = jax.jit(where_each)(np.array([True, False, True, False]), keys, others)
     assert mixed.dtype == keys.dtype
     data, own, other = map(jax.random.key_data, (mixed, keys, others))
     np.testing.assert_array_equal(data, [own[0], other[1], own[2], other[3]])
-    episodes, outcome = rollout(KeyedWalk(), lambda _, obs: obs["desired_goal"], jax.random.key(0), 8)
+    episodes, outcome = jax.jit(lambda: rollout(KeyedWalk(), lambda _, obs: obs["desired_goal"], jax.random.key(0), 8))()
     assert episodes.length.min() < 12
     assert outcome.valid.all()
     many = mjx_dher.gym.GymVectorEnv("test_odd_numbers:KeyedWalk", num_envs=8)
@@ -237,7 +239,7 @@ def test_rewards_of_goals_are_float32():
 
 
 def test_demonstrations_are_written_to_and_read_from_an_npz_alone(tmp_path):
-    episodes = rollout(Walk(), lambda _, obs: obs["desired_goal"], jax.random.key(0), 3)[0]
+    episodes, _ = jax.jit(lambda: rollout(Walk(), lambda _, obs: obs["desired_goal"], jax.random.key(0), 3))()
     for name in ("demos", "demos.npy", Path("demos.NPZ")):
         with refuses(".npz", Path(name).suffix):
             write_demonstrations(tmp_path / name, episodes)

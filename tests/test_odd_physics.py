@@ -154,12 +154,13 @@ def test_varied_friction_stays_where_an_engine_computes_it():
 def test_an_arms_observed_force_follows_its_varied_gain():
     env = envs.make("arm_push_easy", engine="native", varied={"gain:joint*": (2.0, 2.0)})
     action = jnp.array([0.5, 0.2, -0.3, 0.4, 1.0])
-    before = env.reset(jax.random.key(0))
-    physics = (after := env.step(before, action)).physics
+    before = jax.jit(env.reset)(jax.random.key(0))
+    physics = (after := jax.jit(env.step)(before, action)).physics
     simulator = Simulator(env.model, derived=["actuator_force"], varied=["gain:joint*"])
-    ctrl = env.controls(before.physics, action).ctrl
-    data = simulator.make_data().replace(qpos=physics.qpos, qvel=physics.qvel, ctrl=ctrl, factors=physics.factors)
-    true = env.scale * simulator.forward(data).derived["actuator_force"][env.forces].sum()
+    ctrl = jax.jit(env.controls)(before.physics, action).ctrl
+    state = {"qpos": physics.qpos, "qvel": physics.qvel, "ctrl": ctrl, "factors": physics.factors}
+    forces = jax.jit(lambda state: simulator.forward(simulator.make_data().replace(**state)).derived["actuator_force"])
+    true = env.scale * np.asarray(forces(state))[env.forces].sum()
     assert abs(true) > 0.01
     np.testing.assert_allclose(after.obs["observation"][env.layout["force"]], [true], atol=1e-4)
 

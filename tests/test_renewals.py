@@ -81,7 +81,7 @@ def test_one_of_several_priorities_is_renewed_in_rows_as_it_is_alone():
 def test_a_lane_logs_the_mean_priority_of_new_episodes_beside_one_that_renews():
     def logged(priority, hparams):
         train = make_train(ENV, SMALL, priority=priority)
-        return jax.jit(train.epoch)(train.init(jax.random.key(0), hparams))[1]["priority_mean"]
+        return jax.jit(train.epoch)(jax.jit(train.init)(jax.random.key(0), hparams))[1]["priority_mean"]
 
     lane = Lane(*HParams(), choice=0, priority_choice=0, generator_choice=0)
     together = logged(priorities.join([priorities.eventful, BY_CYCLE]), lane)

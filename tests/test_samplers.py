@@ -107,10 +107,11 @@ def test_draw_follows_the_probabilities():
 def test_draw_never_takes_what_has_no_weight():
     # Weights that do not add up exactly in float32, with holes everywhere.
     key, mask_key, draw_key = jax.random.split(jax.random.key(1), 3)
-    weights = jax.random.uniform(key, (200_000, 51), minval=1e-6)
-    mask = jax.random.bernoulli(mask_key, 0.3, weights.shape).at[:, 7].set(True)
-    index = samplers.draw(draw_key, jnp.where(mask, jnp.log(weights), -jnp.inf))
-    assert bool(jnp.all(mask[jnp.arange(len(index)), index]))
+    weights = np.asarray(jax.random.uniform(key, (200_000, 51), minval=1e-6))
+    mask = np.array(jax.random.bernoulli(mask_key, 0.3, weights.shape))
+    mask[:, 7] = True
+    index = np.asarray(jax.jit(samplers.draw)(draw_key, np.where(mask, np.log(weights), -np.inf)))
+    assert mask[np.arange(len(index)), index].all()
 
 
 @pytest.mark.parametrize("name", COMPONENTS["sampler"])

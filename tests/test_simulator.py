@@ -87,10 +87,11 @@ def test_a_scan_of_a_batch_is_a_loop_over_mj_step(xml):
         data = jax.vmap(sim.step)(data, ctrl)
         return data, data
 
-    _, states = jax.jit(lambda data: jax.lax.scan(step, data, controls))(first)
+    states = jax.jit(lambda data: jax.lax.scan(step, data, controls)[1])(first)
+    first, states, controls = jax.device_get((first, states, controls))
     assert np.ptp(states.qpos, axis=1).max() > 0.1  # they went different ways
     for i in range(4):
-        expected = loop(model, jax.tree.map(lambda x, i=i: x[i], first), np.asarray(controls[:, i]), substeps=3)
+        expected = loop(model, jax.tree.map(lambda x, i=i: x[i], first), controls[:, i], substeps=3)
         for t, state in enumerate(expected):
             for name in STATE:
                 np.testing.assert_array_equal(getattr(states, name)[t, i].ravel(), state[name].ravel(), err_msg=name)
@@ -249,12 +250,12 @@ def test_every_derived_field_is_what_mujoco_computes_or_rejected(xml):
     names = sorted(set(DATA_FIELDS) - set(STATE) - set(REJECTED))
     assert {"cfrc_ext", "cfrc_int", "cacc", "subtree_linvel", "subtree_angmom", "energy", "sensordata", "xpos"} <= set(names)
     sim = Simulator(model, derived=names, num_threads=1)
-    many = jax.tree.map(lambda x: jnp.stack([x, x]), sim.make_data())
-    many = many.replace(qvel=jnp.asarray(np.random.default_rng(0).uniform(-0.1, 0.1, (2, model.nv)), jnp.float32))
+    qvel = np.random.default_rng(0).uniform(-0.1, 0.1, (2, model.nv)).astype(np.float32)
+    many = jax.tree.map(lambda x: np.stack([x, x]), sim.make_data()).replace(qvel=qvel)
     functions = {name: jax.jit(jax.vmap(getattr(sim, name))) for name in ("step", "forward")}
     model.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     for function in ("step", "forward", "step"):
-        seen = functions[function](many)
+        seen = jax.device_get(functions[function](many))
         for i in range(2):
             data = mujoco.MjData(model)
             load(model, data, jax.tree.map(lambda x, i=i: x[i], many))
@@ -279,11 +280,10 @@ def test_time_advances_and_delays_last_as_in_a_loop_without_pause(start):
     for _ in range(3):  # until the history has times of its own
         mujoco.mj_step(model, data)
     exact = np.concatenate([[data.time], data.history])
-    first = sim.make_data().replace(**{name: jnp.asarray(getattr(data, name), jnp.float32) for name in STATE})
-    first = first.replace(residue=jnp.asarray(batches.residue(exact), jnp.float32))
+    first = jax.tree.map(np.asarray, sim.make_data()).replace(residue=np.float32(batches.residue(exact)))
+    first = first.replace(**{name: np.float32(getattr(data, name)) for name in STATE})
     last = jax.jit(lambda data: jax.lax.fori_loop(0, 100, lambda _, x: sim.step(x), data))(first)
-    for _ in range(100):
-        mujoco.mj_step(model, data)
+    mujoco.mj_step(model, data, nstep=100)
     np.testing.assert_array_equal(last.time, np.float32(data.time))
     np.testing.assert_array_equal(np.float64(last.time) + np.float64(last.residue[:, 0]).sum(), data.time)
     np.testing.assert_allclose(last.derived["sensordata"], data.sensordata, atol=1e-5)

@@ -97,7 +97,7 @@ def test_an_epoch_counts_what_it_does(program):
         *("relabelled_share", "relabel_distance", "critic_loss", "actor_loss", "q_mean", "actor_norm", "critic_norm"),
         *("discarded_episodes", "bad_rewards", "bad_success", "no_goal_share"),
     }
-    squares = sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(state.learner.params.actor))
+    squares = sum(np.square(x).sum() for x in jax.tree.leaves(jax.device_get(state.learner.params.actor)))
     assert float(metrics["actor_norm"]) == pytest.approx(float(squares) ** 0.5, rel=1e-5)
     # Of 120 transitions, each with probability 0.8: 0.8 within four standard deviations.
     assert abs(metrics["relabelled_share"] - 0.8) < 4 * (0.16 / 120) ** 0.5
@@ -169,20 +169,20 @@ def test_seeds_under_vmap_are_what_they_are_alone_and_differ(program):
     together = jax.jit(jax.vmap(program.init))(keys, hparams)
     for _ in range(2):
         together, metrics = epochs(together)
-    alone = []
+    alone, row_of = [], jax.jit(lambda tree, row: jax.tree.map(lambda x: x[row], tree))
     for row, seed in enumerate(seeds):
         state = program.init(jax.random.key(seed), HParams())
         for _ in range(2):
             state, own_metrics = epoch(state)
         alone.append(state)
-        mine = jax.tree.map(lambda x, row=row: x[row], together)
+        mine = row_of(together, row)
         np.testing.assert_array_equal(jax.random.key_data(mine.key), jax.random.key_data(state.key))
         np.testing.assert_array_equal(mine.replay.episodes.desired_goal, state.replay.episodes.desired_goal)
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-3), mine.learner, state.learner)
         np.testing.assert_allclose(metrics["return_mean"][row], own_metrics["return_mean"], atol=0.3)
     assert not np.array_equal(alone[0].replay.episodes.action, alone[1].replay.episodes.action)
     leaves = zip(jax.tree.leaves(alone[0].learner.params), jax.tree.leaves(alone[1].learner.params))
-    assert max(float(jnp.abs(a - b).max()) for a, b in leaves) > 0.05
+    assert max(np.abs(np.asarray(a) - b).max() for a, b in leaves) > 0.05
 
 
 def test_hparams_are_traced_one_compilation_serves_all(program):

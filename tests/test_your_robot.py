@@ -61,14 +61,15 @@ def test_a_robots_loop_sends_what_the_wrapped_task_sends():
     def policy(obs):
         return np.tanh(obs["observation"] @ weights)
 
-    loop, step = RobotLoop(env, policy), jax.jit(env.step)
+    loop, step, reset = RobotLoop(env, policy), jax.jit(env.step), jax.jit(env.reset)
+    controls = jax.jit(loop.task.controls)
     for key in range(2):
         loop.start()
-        state, filtered = env.reset(jax.random.key(key)), np.zeros(env.action_size)
+        state, filtered = reset(jax.random.key(key)), np.zeros(env.action_size)
         for _ in range(4):
             action = policy(jax.tree.map(np.asarray, state.obs))
             filtered = 0.5 * filtered + 0.5 * action
-            expected = loop.task.controls(state.physics, jnp.float32(filtered)).ctrl
+            expected = controls(state.physics, np.float32(filtered)).ctrl
             found = loop(state.physics.qpos, state.physics.qvel, state.obs["desired_goal"]).ctrl
             np.testing.assert_allclose(found, expected, atol=1e-6)
             state = step(state, action)
