@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import paper_set
 from make_samplers_figure import SITUATIONS, TRAINED, total_variation
-from paper_analysis import DOCS, MARGIN, Difference, area, difference, with_seeds
+from paper_analysis import DOCS, MARGIN, Difference, area, difference, read, with_seeds
 from scipy.stats import spearmanr
 
 from mjx_dher import samplers
@@ -39,7 +39,7 @@ class Point(NamedTuple):
 
 def points(own: bool = False) -> list[Point]:
     """Settings on Push that choose goals by distance, by share: thirteen, or ten with the paper's `own` cycles."""
-    way, push = SITUATIONS["on the way"], paper_set.load_set(paper_set.FOLDER)["push"]
+    way, push = SITUATIONS["on the way"], read(paper_set.FOLDER / "push_curves.csv")
     made = {("samplers", "closest"): ("closest", total_variation(samplers.make("closest"), way))}
     for epsilon in EPSILONS:  # draws at random differ from nothing
         made["samplers", f"epsilon_closest, epsilon {epsilon}"] = (

@@ -1,6 +1,7 @@
 """What the pages say in tables: every table renders, and numbers are those of the committed curves."""
 
 import csv
+import functools
 import re
 
 import make_comparison_tables
@@ -95,17 +96,26 @@ def test_the_tables_of_scaling_are_of_the_file():
     assert make_scaling_figure.with_table(page) == page
 
 
-@pytest.mark.parametrize("page", make_comparison_tables.PAGES, ids=lambda page: page.name)
-def test_tables_of_comparisons_are_those_of_their_reports(page):
+REPORTS = {page.name: page for page in make_comparison_tables.PAGES}
+
+
+@functools.cache
+def report(name):
+    """The rows of a report."""
+    return tuple(make_comparison_tables.read(REPORTS[name]))
+
+
+@pytest.mark.parametrize("name", REPORTS)
+def test_tables_of_comparisons_are_those_of_their_reports(name):
     """An arm is shown when all of its seeds have been run."""
-    rows = make_comparison_tables.read(page)
+    page, rows = REPORTS[name], report(name)
     assert make_comparison_tables.with_table(page, rows) == page.page.read_text()
     assert {row.seeds for row in rows} == {page.seeds}
 
 
 def test_the_verdicts_that_joint_flips_would_change_are_named():
     page = " ".join((ROOT / "docs" / "what_helps.md").read_text().split())
-    rows = [row for page in make_comparison_tables.PAGES for row in make_comparison_tables.read(page)]
+    rows = [row for name in REPORTS for row in report(name)]
     changed = [row for row in rows if row.p_value == row.p_value and (row.p_corrected < 0.05) != (row.p_joint < 0.05)]
     shown = {"not_misleading": "PickAndPlace", "energy": "Slide", "tqc_k4": "Push", "k1": "hand_reach", "k8": "hand_reach"}
     assert {row.arm: make_comparison_tables.NAMES.get(row.task, row.task) for row in changed} == shown
@@ -147,7 +157,7 @@ def test_loss_grows_with_the_preference_for_near_goals():
         assert f"Spearman {make_preference_figure.correlation(points):.2f}" in page
     ranks = [np.argsort(np.argsort(values)) for values in ([p.share for p in found], [p.gain.mean for p in found])]
     assert np.corrcoef(*ranks)[0, 1] < -0.85  # ties, of `max` and `minmax`, apart
-    push = paper_set.load_set(paper_set.FOLDER)["push"]
+    push = paper_analysis.read(paper_set.FOLDER / "push_curves.csv")
     base, own = (push["samplers", name].success[:, :30] for name in ("future", "closest"))
     by_hand = np.mean([np.trapezoid(a - b) / 29 for a, b in zip(own, base)])
     assert {p.name: p.gain.mean for p in found}["closest"] == pytest.approx(by_hand)
@@ -282,8 +292,8 @@ def areas(curves, epochs):
 def test_slide_s_pooled_loss_over_all_epochs_and_over_the_first_hundred(committed):
     """The sweeps differ by no more than their seeds make them, so 1 / variance is their weight."""
     sweeps = [({name: committed["slide", sweep, name] for name in ("weighted", "future")}) for sweep in ("own_slide", "slide")]
+    older = paper_analysis.read(ROOT / "docs" / "paper_slide_curves.csv")
     for sweep in ("samplers", "fast", "hopper"):
-        older = paper_analysis.load()["slide"]
         sweeps.append({name: dict(enumerate(older[sweep, name].success)) for name in ("weighted", "future")})
     results, readme = (" ".join((ROOT / name).read_text().split()) for name in ("docs/results.md", "README.md"))
     for epochs in (200, 100):
