@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from configs import SHORT, TINY
 from conftest import refuses
-from sweep_helpers import compile_once, make_grid, run, spec_of  # noqa: F401
+from sweep_helpers import LONGER, compile_once, make_grid, run  # noqa: F401
 from test_comparison import cell
 
 import mjx_dher
@@ -76,7 +76,7 @@ def test_a_mean_at_the_limit_stops_live_and_read_again():
 
 
 def test_a_trial_that_stopped_early_is_trained_again(tmp_path):
-    trials = make_grid(samplers=("future",), seeds=(0,), static=dataclasses.replace(spec_of().config, total_steps=480))
+    trials = make_grid(samplers=("future",), seeds=(0,), static=LONGER)
     run(tmp_path, trials)
     folder = grid.folder_of(tmp_path, trials[0])
     assert results.is_done(folder, trials[0])
@@ -87,7 +87,7 @@ def test_a_trial_that_stopped_early_is_trained_again(tmp_path):
         else:
             (folder / name).write_text("\n".join(text.splitlines()[:2]) + "\n")
     assert not results.is_done(folder, trials[0])
-    with refuses("240 of 480 steps", "train it again", error=FolderError):
+    with refuses("240 of 1,200 steps", "train it again", error=FolderError):
         tables.read(tmp_path)
 
 
