@@ -1,6 +1,6 @@
 """Ablation of the preset `gpu` on PickAndPlace and Slide. Each arm omits one part of the preset; seeds are paired.
 
-    python bench/ablation.py --out ablation --plan      what would be trained, and how long it would take
+    python bench/ablation.py --out ablation --plan      what would be trained
     python bench/ablation.py --out ablation             trains and reports; run it again to resume
     python bench/ablation.py --out ablation --report    reports the runs that have ended
     python bench/ablation.py --out ablation --runs docs/ablation_runs.csv   trains only the runs missing in that file
@@ -18,7 +18,7 @@ from collections.abc import Callable
 from typing import Any
 
 import bakeoff
-from bakeoff_arms import SIZES, TOY, Arm, Experiment, minutes_of_best, tuned
+from bakeoff_arms import SIZES, TOY, Arm, Experiment, tuned
 
 from mjx_dher.spec import RunSpec
 
@@ -71,18 +71,11 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """
     del learner
     run = dataclasses.replace(tuned("slide" if toy else task, priority="eventful"), env=task)
-    sizes = {**TOY, "target_period": 10} if toy else SIZES["best", task].changes
+    sizes = {**TOY, "target_period": 10} if toy else SIZES["best", task]
     return CHANGES[arm.name](sized(run, n_step=3, **sizes))
 
 
-ABLATION = Experiment(
-    arms=ARMS,
-    learners=("gpu",),
-    tasks=("pick_and_place", "slide"),
-    spec_of=spec_of,
-    minutes=minutes_of_best,
-    table="ablation.csv",
-)
+ABLATION = Experiment(ARMS, ("gpu",), ("pick_and_place", "slide"), spec_of, "ablation.csv")
 
 if __name__ == "__main__":
     sys.exit(bakeoff.main(None, ABLATION, __doc__))

@@ -21,7 +21,7 @@ from pathlib import Path
 import bakeoff
 import bakeoff_arms
 import numpy as np
-from bakeoff_arms import COMPILE_SECONDS, SIZES, TASKS, TOY, Arm, Experiment
+from bakeoff_arms import TASKS, TOY, Arm, Experiment
 from bakeoff_runs import load
 
 from mjx_dher import presets
@@ -98,43 +98,15 @@ def tuned(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     return with_k(task, arm, KS[0] if toy else best_k(task, arm.name), toy)
 
 
-def _minutes(
-    seconds: dict[str, float], learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int
-) -> float:
-    """Minutes from the seconds of a run of `future` by task. Other groups than "plain" take half as long again."""
-    programs = len(learners) * len(tasks) * len({arm.group for arm in arms})
-    runs = sum(1.0 if arm.group == "plain" else 1.5 for arm in arms) * seeds * len(learners)
-    return (runs * sum(seconds[task] for task in tasks) + COMPILE_SECONDS * programs) / 60
-
-
-_PAPER = {task: SIZES["paper", task].seconds for task in TASKS}
-_in_paper = functools.partial(_minutes, _PAPER)
 TUNED_ARMS = tuple(
     dataclasses.replace(arm, name=f"{arm.name}_k{k}", numbers={**arm.numbers, "her_k": float(k)}) for arm in METHODS for k in KS
 )
 EXPERIMENTS = {
-    # Seconds: of two CPU cores, measured; and of PickAndPlace with 16 workers, 33 s on an H100, scaled to 19.
-    "cher": Experiment(
-        _arms("future", "curriculum"),
-        ("one_worker",),
-        ("reach",),
-        cher,
-        functools.partial(_minutes, {"reach": 20.0}),
-        "cher.csv",
-    ),
-    "ebp": Experiment(
-        _arms("future", "energy_clipped", "energy"),
-        ("workers",),
-        ("pick_and_place",),
-        ebp,
-        functools.partial(_minutes, {"pick_and_place": 40.0}),
-        "ebp.csv",
-    ),
-    "next_future": Experiment(
-        _arms("future", "next_future"), ("5cm", "2cm"), TASKS[:2], next_future, _in_paper, "next_future.csv"
-    ),
-    "tune": Experiment(TUNED_ARMS, ("paper",), TASKS, tune, _in_paper, "tune.csv"),
-    "test": Experiment(METHODS, ("paper",), TASKS, tuned, _in_paper, "test.csv"),
+    "cher": Experiment(_arms("future", "curriculum"), ("one_worker",), ("reach",), cher, "cher.csv"),
+    "ebp": Experiment(_arms("future", "energy_clipped", "energy"), ("workers",), ("pick_and_place",), ebp, "ebp.csv"),
+    "next_future": Experiment(_arms("future", "next_future"), ("5cm", "2cm"), TASKS[:2], next_future, "next_future.csv"),
+    "tune": Experiment(TUNED_ARMS, ("paper",), TASKS, tune, "tune.csv"),
+    "test": Experiment(METHODS, ("paper",), TASKS, tuned, "test.csv"),
 }
 
 

@@ -1,6 +1,6 @@
 """Bake-off of hindsight methods: every arm of bench/bakeoff_arms.py against `future`, with the same seeds.
 
-    python bench/bakeoff.py --out bakeoff --plan        what would be trained, and how long it would take
+    python bench/bakeoff.py --out bakeoff --plan        what would be trained
     python bench/bakeoff.py --out bakeoff               trains and reports; run it again to resume
     python bench/bakeoff.py --out bakeoff --report      reports the runs that have ended
     python bench/bakeoff.py --out toy --toy --seeds 3   the same on the point mass, on a CPU in minutes
@@ -98,7 +98,7 @@ def trials_of(args: argparse.Namespace, learner: str, task: str, group: str) -> 
 
 
 def plan(args: argparse.Namespace, console: Console) -> None:
-    """Prints the runs of each sweep, the number already done, and the total minutes."""
+    """Prints the runs of each sweep, and the number already done."""
     for learner in args.learners:
         for task in args.tasks:
             folder = folder_of(args, learner, task)
@@ -106,9 +106,6 @@ def plan(args: argparse.Namespace, console: Console) -> None:
             done = sum(is_done(args, folder, run) for run in runs)
             steps = runs[0].config.total_steps
             console.print(f"{folder}: {len(runs)} runs of {steps:,} steps, {done} done; learner {runs[0].learner}")
-    if not args.toy:
-        minutes = args.experiment.minutes(tuple(args.learners), tuple(args.tasks), tuple(args.arms), args.seeds)
-        console.print(f"about {minutes:.0f} minutes by the experiment's estimate, which was not measured for these arms")
 
 
 def train(args: argparse.Namespace, console: Console) -> bool:

@@ -45,7 +45,6 @@ class Experiment:
     learners: tuple[str, ...]
     tasks: tuple[str, ...]
     spec_of: Callable[[str, str, Arm, bool], Any]  # the RunSpec of a learner, task and arm, seed 0; the last one: as a toy
-    minutes: Callable[[tuple[str, ...], tuple[str, ...], tuple[Arm, ...], int], float]  # of one H200, by an estimate
     table: str  # name of the report's table
     tests: int | None = None  # comparisons of a task that p is corrected over; by default, each learner's arms
 
@@ -165,31 +164,21 @@ ARMS = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class Size:
-    """Sizes of a task's runs, and the cost of one run."""
-
-    changes: Mapping[str, Any]  # to the preset's Config
-    seconds: float  # per run on an H200, from measured sweeps of `future`, scaled by the environment steps
-
-
-# The fast sweeps of docs/results.md, cut when `future` has learned: 7.0, 16.1 and 39.9 s per run of 50, 50 and 200 epochs.
+# The fast sweeps of docs/results.md, cut when `future` has learned.
 _FAST = {"num_envs": 800, "cycles_per_epoch": 1, "updates_per_cycle": 2000, "learner_dtype": "bfloat16"}
 # The preset until 2026-11-27, which the plans name.
 _HAND = {"cycles_per_epoch": 1, "updates_per_cycle": 1000, "learner_dtype": "float32", "renewals": 5}
-# From five parallel runs in bench/README.md: 4.4, 11.8 and 40.2 s per run of 1.54, 1.02 and 8.19 million steps. The hand:
-# four runs of 4.1 million steps took 198 s, and five of `hand_reach` 55 s (docs/experiments/preset_hands.md).
-SIZES = {
-    ("paper", "push"): Size({**_FAST, "total_steps": 1_000_000}, 7.0 * 25 / 50),
-    ("paper", "pick_and_place"): Size({**_FAST, "num_envs": 1600, "total_steps": 2_000_000}, 16.1 * 25 / 50),
-    ("paper", "slide"): Size({**_FAST, "total_steps": 2_000_000}, 39.9 * 50 / 200),
-    ("best", "push"): Size({"cycles_per_epoch": 1, "total_steps": 819_200}, 4.4 * 0.819 / 1.536),
-    ("best", "pick_and_place"): Size({"total_steps": 640_000}, 11.8 * 0.64 / 1.024),
-    ("best", "slide"): Size({"cycles_per_epoch": 1, "total_steps": 1_740_800}, 40.2 * 1.741 / 8.192),
-    ("best", "hand_reach"): Size({"total_steps": 1_024_000}, 11.0),
-    ("best", "block_rotate_z"): Size({**_HAND, "total_steps": 1_536_000}, 49.5 * 1.536 / 4.1),
+# Changes to the preset's Config by learner and task.
+SIZES: dict[tuple[str, str], dict[str, Any]] = {
+    ("paper", "push"): {**_FAST, "total_steps": 1_000_000},
+    ("paper", "pick_and_place"): {**_FAST, "num_envs": 1600, "total_steps": 2_000_000},
+    ("paper", "slide"): {**_FAST, "total_steps": 2_000_000},
+    ("best", "push"): {"cycles_per_epoch": 1, "total_steps": 819_200},
+    ("best", "pick_and_place"): {"total_steps": 640_000},
+    ("best", "slide"): {"cycles_per_epoch": 1, "total_steps": 1_740_800},
+    ("best", "hand_reach"): {"total_steps": 1_024_000},
+    ("best", "block_rotate_z"): {**_HAND, "total_steps": 1_536_000},
 }
-COMPILE_SECONDS = 30.0  # per program
 TOY: dict[str, Any] = {
     "num_envs": 16,
     "cycles_per_epoch": 5,
@@ -239,24 +228,11 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     parts = {"priority": "eventful", **parts_of(task, arm)}  # the preset of Slide has `td_error`
     run = presets.preset("paper", task, **parts) if learner == "paper" else tuned(task, **parts)
     # A ring for all transitions: a larger one costs only memory.
-    changes = TOY if toy else {**SIZES[learner, task].changes, "replay_size": SIZES[learner, task].changes["total_steps"]}
+    changes = TOY if toy else {**SIZES[learner, task], "replay_size": SIZES[learner, task]["total_steps"]}
     numbers = dict(arm.numbers)
     if arm.prioritized and learner == "paper":
         numbers["priority_fraction"] = 1.0
     return dataclasses.replace(run, config=dataclasses.replace(run.config, **changes), hparams=run.hparams._replace(**numbers))
 
 
-def estimated_minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
-    """Minutes of one H200 for the runs, estimated from sweeps of `future`, compilation included."""
-    sizes = [SIZES[learner, task] for learner in learners for task in tasks]
-    programs = len(sizes) * len({arm.group for arm in arms})
-    return (sum(size.seconds for size in sizes) * len(arms) * seeds + COMPILE_SECONDS * programs) / 60
-
-
-def minutes_of_best(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
-    """`estimated_minutes` of runs with the sizes of `best` for all learners."""
-    del learners
-    return estimated_minutes(("best",), tasks, arms, seeds)
-
-
-BAKEOFF = Experiment(ARMS, LEARNERS, TASKS, spec_of, estimated_minutes, "bakeoff.csv")
+BAKEOFF = Experiment(ARMS, LEARNERS, TASKS, spec_of, "bakeoff.csv")

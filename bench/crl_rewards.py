@@ -89,14 +89,8 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     return dataclasses.replace(run, env=POSITIVE.get(task, task) if arm.name == "positive" and learner in HER else task)
 
 
-def minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
-    """Estimated minutes of one H100, compilation included."""
-    times = [*learners, *(len(arms) - 1) * [name for name in learners if name in HER]]
-    return sum(crl.minutes(("equal",), tasks, (SETTINGS[name],), seeds) for name in times)
-
-
 TASKS = ("arm_push_easy", "pick_and_place", *(task for task in crl.SIZES if task not in POSITIVE))
-REWARDS = Experiment(ARMS, tuple(SETTINGS), TASKS, spec_of, minutes, "rewards.csv", len(HER))
+REWARDS = Experiment(ARMS, tuple(SETTINGS), TASKS, spec_of, "rewards.csv", len(HER))
 
 
 class Played(NamedTuple):

@@ -14,7 +14,7 @@ import sys
 
 import bakeoff
 from ablation import numbered, sized
-from bakeoff_arms import SIZES, TOY, Arm, Experiment, minutes_of_best
+from bakeoff_arms import SIZES, TOY, Arm, Experiment
 
 from mjx_dher import presets
 from mjx_dher.spec import RunSpec
@@ -34,19 +34,12 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     del learner
     parts = {"sampler": "future", "priority": "eventful", **arm.parts}
     run = dataclasses.replace(presets.preset("gpu", "hand_reach" if toy else task, **parts), env=task)
-    sizes = TOY if toy else SIZES["best", task].changes
+    sizes = TOY if toy else SIZES["best", task]
     run = sized(run, **{"replay_size": sizes["total_steps"], **sizes})
     return numbered(run, **{"her_k": 4.0, "priority_fraction": 0.0, **arm.numbers})
 
 
-HANDS = Experiment(
-    arms=ARMS,
-    learners=("gpu",),
-    tasks=("hand_reach", "block_rotate_z"),
-    spec_of=spec_of,
-    minutes=minutes_of_best,
-    table="hands.csv",
-)
+HANDS = Experiment(ARMS, ("gpu",), ("hand_reach", "block_rotate_z"), spec_of, "hands.csv")
 
 if __name__ == "__main__":
     sys.exit(bakeoff.main(None, HANDS, __doc__))

@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import bakeoff
 from ablation import sized
-from bakeoff_arms import SIZES, TOY, Arm, Experiment, minutes_of_best, tuned
+from bakeoff_arms import SIZES, TOY, Arm, Experiment, tuned
 
 from mjx_dher.spec import RunSpec
 
@@ -37,17 +37,11 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Run of an arm, seed 0, with the priority `td_error`, which both presets had."""
     del learner
     run = dataclasses.replace(tuned("slide" if toy else task, priority="td_error"), env=task)
-    return CHANGES[arm.name](sized(run, **(TOY if toy else SIZES["best", task].changes)))
+    return CHANGES[arm.name](sized(run, **(TOY if toy else SIZES["best", task])))
 
 
-CRITICS = Experiment(
-    arms=tuple(Arm(name, name) for name in CHANGES),
-    learners=("gpu",),
-    tasks=("slide", "block_rotate_z"),
-    spec_of=spec_of,
-    minutes=minutes_of_best,
-    table="modern_critics.csv",
-)
+ARMS = tuple(Arm(name, name) for name in CHANGES)
+CRITICS = Experiment(ARMS, ("gpu",), ("slide", "block_rotate_z"), spec_of, "modern_critics.csv")
 
 if __name__ == "__main__":
     sys.exit(bakeoff.main(None, CRITICS, __doc__))

@@ -15,7 +15,7 @@ import sys
 import bakeoff
 import bakeoff_arms
 import jax.numpy as jnp
-from bakeoff_arms import COMPILE_SECONDS, SIZES, Arm, Experiment
+from bakeoff_arms import Arm, Experiment
 
 from mjx_dher import priorities
 from mjx_dher.priorities import Priority
@@ -51,14 +51,7 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     return dataclasses.replace(run, hparams=run.hparams._replace(**arm.numbers))
 
 
-def minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
-    """Minutes of one H200 for the runs, estimated from sweeps of `future`, compilation included."""
-    sizes = [SIZES[learner, task].seconds for learner in learners for task in tasks]
-    runs = sum(1.0 if arm.group == "plain" else SLOWER for arm in arms)
-    return (sum(sizes) * runs * seeds + COMPILE_SECONDS * len(sizes) * len({arm.group for arm in arms})) / 60
-
-
-CONTROLS = Experiment(ARMS, ("best", "paper"), TASKS, spec_of, minutes, "td_controls.csv")
+CONTROLS = Experiment(ARMS, ("best", "paper"), TASKS, spec_of, "td_controls.csv")
 
 if __name__ == "__main__":
     sys.exit(bakeoff.main(None, CONTROLS, __doc__))

@@ -13,7 +13,7 @@ import dataclasses
 import sys
 
 import bakeoff
-from bakeoff_arms import COMPILE_SECONDS, TOY, Arm, Experiment
+from bakeoff_arms import TOY, Arm, Experiment
 
 from mjx_dher import presets
 from mjx_dher.components import robot
@@ -21,20 +21,6 @@ from mjx_dher.spec import RunSpec
 
 HANDS = ("hand_reach", "block_rotate_z", "block_rotate_parallel", "block_rotate_xyz", "egg_rotate")
 TASKS = ("reach", "push", "pick_and_place", "slide", *HANDS)
-# Seconds of one run among those that train together, from docs/experiments/presets.md and preset_hands.md.
-SECONDS = {
-    ("cpu", "reach"): 20.0,
-    ("cpu", "push"): 117.0,
-    ("cpu", "pick_and_place"): 360.0,
-    ("cpu", "slide"): 1020.0,
-    ("gpu", "push"): 4.4,
-    ("gpu", "pick_and_place"): 7.8,
-    ("gpu", "slide"): 107.0,
-    ("gpu", "block_rotate_z"): 26.0,
-    ("gpu", "block_rotate_parallel"): 55.0,
-    ("gpu", "block_rotate_xyz"): 56.0,
-    ("gpu", "egg_rotate"): 73.0,
-}
 
 
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
@@ -44,14 +30,7 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     return dataclasses.replace(run, config=dataclasses.replace(run.config, **TOY, n_step=1)) if toy else run
 
 
-def minutes(learners: tuple[str, ...], tasks: tuple[str, ...], arms: tuple[Arm, ...], seeds: int) -> float:
-    """Minutes of the runs with a known time, compilation included: `cpu` of two cores, the others of one GPU."""
-    del arms
-    each = [SECONDS.get((learner, task), 0.0) for learner in learners for task in tasks]
-    return (sum(each) * seeds + COMPILE_SECONDS * len(each)) / 60
-
-
-UNSEEN = Experiment((Arm("preset", "plain"),), ("cpu", "gpu", "frugal"), TASKS, spec_of, minutes, "unseen.csv")
+UNSEEN = Experiment((Arm("preset", "plain"),), ("cpu", "gpu", "frugal"), TASKS, spec_of, "unseen.csv")
 
 if __name__ == "__main__":
     sys.exit(bakeoff.main(None, UNSEEN, __doc__))

@@ -64,10 +64,6 @@ def test_every_arm_is_a_run_of_every_task_and_learner(arms):
     assert "next_future" in COMPONENTS["sampler"]
 
 
-def test_the_plan_fits_into_two_hours(arms):
-    assert 60 < arms.estimated_minutes(arms.LEARNERS, arms.TASKS, arms.ARMS, 10) < 110
-
-
 def changes(spec, base):
     """What differs between two runs, by field."""
     mine, theirs = fingerprint.settings(spec), fingerprint.settings(base)
@@ -117,7 +113,6 @@ def test_the_arms_of_contrastive_rl_and_her_share_all_but_what_their_names_say(m
         for group in crl.CONTRASTIVE.groups:  # one program each
             assert len({specs[arm.name].program for arm in crl.ARMS if arm.group == group}) == 1
         validate(crl.spec_of("equal", task, crl.ARMS[0], True))
-    assert 8 < crl.minutes(("equal",), ("push", "pick_and_place", "arm_push_easy"), crl.ARMS, 10) < 14
 
 
 def test_every_arm_of_the_ablation_is_a_toy_too(ablation):
@@ -225,7 +220,6 @@ def test_a_plan_trains_nothing(bakeoff, tmp_path, capsys):
     assert bakeoff.main(["--out", str(tmp_path / "b"), "--plan", "--arms", "energy", "--seeds", "3"]) == 0
     text = capsys.readouterr().out
     assert "best-slide: 6 runs" in text
-    assert "minutes by the experiment" in text
     assert not (tmp_path / "b").exists()
 
 
