@@ -1,6 +1,6 @@
 """Runs the experiment of docs/results.md. Each figure is one command; run it again to resume.
 
-    python bench/paper.py --plan              # what would run, and the estimated time
+    python bench/paper.py --plan              # what would run
     python bench/paper.py samplers            # one figure: its sweeps, and its curves into docs/paper
     python bench/paper.py k_push k_slide      # some sweeps of a figure, by name
     python bench/paper.py all                 # all figures
@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import math
 import os
 import signal
 import subprocess
@@ -37,6 +36,7 @@ CURVES = ROOT / "docs" / "paper"
 COLUMNS = ("sweep", "setting", "seed", "epoch", "env_steps", "success_rate")
 XLA_FLAGS = "--xla_gpu_enable_cublaslt=true --xla_gpu_enable_triton_gemm=false"
 SEEDS = 10
+LANES = 40  # most parallel runs
 # The paper's epoch is 50 cycles of two episodes per worker. Here it is one cycle of as many episodes and updates.
 FAST = "--cycles-per-epoch 1 --updates-per-cycle 2000 --learner-dtype bfloat16"
 EPISODES = {"push": 800, "pick_and_place": 1600, "slide": 800}  # per epoch
@@ -127,7 +127,7 @@ def command(sweep: Sweep, out: Path, toy: bool = False) -> list[str]:
         episodes = EPISODES[sweep.task]
         cycles = "" if sweep.own_cycles else f"{FAST} --num-envs {episodes}"
         seeds = f"--seeds {sweep.seeds} --first-seed {sweep.first_seed}"
-        sizes = f"--preset paper --checkpoint-every 0 --lanes {_LANES} {cycles} --env {sweep.task} {seeds}"
+        sizes = f"--preset paper --checkpoint-every 0 --lanes {LANES} {cycles} --env {sweep.task} {seeds}"
         options = f"--total-steps {sweep.epochs * episodes * 50} {sweep.options}"
     threshold = "0.6" if sweep.task == "slide" else "0.9"
     baseline = "future" if "future" in sweep.options else sweep.options.split()[1]
@@ -139,28 +139,6 @@ def command(sweep: Sweep, out: Path, toy: bool = False) -> list[str]:
     ]
 
 
-# Parts of an estimate, measured on one H200 (bench/README.md, docs/engines.md) with 40 parallel runs.
-_UPDATE = 23.8e-6  # seconds of gradients and drawing per run and update of 2,048 in bfloat16
-_FLOAT32 = 82.2e-6  # the same in float32 with 20 parallel runs
-_STEPS_A_SECOND = {"push": 1.680e6, "pick_and_place": 0.889e6, "slide": 0.900e6}  # at 32,768 environments
-_MORE = 1.25  # whole epochs over the sum of their parts, in the sweeps of 2026-11-22
-# Seconds of an epoch with own cycles, whatever the number of runs: from three sweeps on an H100, and from a part of Slide's.
-_CYCLES = {"push": 2.5, "pick_and_place": 5.0, "slide": 7.5}
-_LANES = 40
-_AROUND = 38.0  # seconds per command: compiling (24 to 47), imports, last evaluations, tables (12)
-
-
-def estimate(sweep: Sweep) -> float:
-    """Seconds of a sweep on one H200, estimated from measured parts."""
-    workers = 2 if sweep.task == "pick_and_place" else 1  # times 8, and with them the batch
-    steps = (EPISODES[sweep.task] + 100) * 50  # with the evaluation
-    update = _FLOAT32 if sweep.own_cycles else _UPDATE
-    epoch = 2000 * workers * update + steps / _STEPS_A_SECOND[sweep.task]
-    runs = sweep.settings * sweep.seeds
-    waiting = _CYCLES[sweep.task] * sweep.epochs * math.ceil(runs / _LANES) if sweep.own_cycles else 0.0
-    return _AROUND + _MORE * epoch * sweep.epochs * runs + waiting
-
-
 def chosen(names: Iterable[str]) -> list[Sweep]:
     """Sweeps by the names of figures, `all`, or sweeps, without duplicates."""
     each = [sweep for name in names for sweep in (SWEEPS if name == "all" else FIGURES.get(name) or (BY_NAME[name],))]
@@ -168,14 +146,13 @@ def chosen(names: Iterable[str]) -> list[Sweep]:
 
 
 def plan(sweeps: Sequence[Sweep], out: Path, toy: bool) -> str:
-    """The commands of sweeps, and their estimated time."""
+    """The commands of sweeps."""
     lines = []
     for name, figure in FIGURES.items():
         if ours := [sweep for sweep in figure if sweep in sweeps]:
-            minutes = sum(map(estimate, ours)) / 60
-            lines.append(f"# {name}: {sum(s.settings for s in ours)} settings, {minutes:.1f} minutes by the estimate")
+            lines.append(f"# {name}: {sum(s.settings for s in ours)} settings")
             lines += ["python train.py " + " ".join(command(sweep, out, toy)) for sweep in ours]
-    return "\n".join([*lines, f"# {sum(map(estimate, sweeps)) / 60:.1f} minutes of one H200, by the estimate"])
+    return "\n".join(lines)
 
 
 def run(sweeps: Sequence[Sweep], out: Path, curves: Path, toy: bool, at_once: int) -> int:
@@ -291,7 +268,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("sweeps/paper"), help="folder of the sweeps")
     parser.add_argument("--curves", type=Path, help="folder of the curves: docs/paper, and under --out with --toy")
     parser.add_argument("--at-once", type=int, default=1, help="parallel sweeps: one computes while another compiles")
-    parser.add_argument("--plan", action="store_true", help="print the commands and an estimate, and run nothing")
+    parser.add_argument("--plan", action="store_true", help="print the commands, and run nothing")
     parser.add_argument("--toy", action="store_true", help="Reach, two seeds, tiny sizes: tries the mechanics on a CPU")
     args = parser.parse_args()
     wanted = args.figures or ["all"]

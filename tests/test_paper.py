@@ -62,12 +62,6 @@ def test_every_command_trains_what_the_page_says(trials):
     assert {run.hparams.random_noise for s, runs in trials.items() if s.name == "noise_slide" for run in runs} == {0.0}
 
 
-def test_the_set_fits_three_hours_by_the_estimate():
-    assert 6000 < sum(map(paper.estimate, SWEEPS)) <= 3 * 3600
-    push = paper.Sweep("x", "push", 50, 1, "")  # 2,000 updates of 23.8 us and 45,000 steps at 1.68 million a second
-    assert paper.estimate(push) == pytest.approx(38 + 1.25 * (0.0476 + 45_000 / 1.68e6) * 50 * 10)
-
-
 def finished(run):
     """A trial as `tables.read` gives it, of two epochs."""
     settings = {**fingerprint.settings(run), "engine": "none", "source": ""}
