@@ -9,16 +9,20 @@ a CPU: the peak of the whole program.
 from __future__ import annotations
 
 import argparse
+import json
 import resource
+import sys
 from typing import Any
-
-import apart
 
 from mjx_dher import presets
 from mjx_dher.contract import env_spec
+from mjx_dher.system import subprocesses
+
+MEASURE = "measure"  # argument of the programs that this one starts
 
 
 def measure(env: str, engine: str, preset: str, num_envs: str) -> list[str]:
+    """Sizes of the replay ring and of the peaks, in this program."""
     import dataclasses
 
     import jax
@@ -61,11 +65,17 @@ def main() -> None:
     environ = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
     for env in args.env:
         for num_envs in args.num_envs:
-            found = apart.measured(__file__, (env, args.engine, args.preset, str(num_envs)), environ)
-            rows.append((env, num_envs, *found))
+            command = [sys.executable, __file__, MEASURE, env, args.engine, args.preset, str(num_envs)]
+            answer = subprocesses.ask(command, environ)
+            if answer.failure:
+                sys.exit(f"{' '.join(command)} failed:\n{answer.err.strip() or answer.failure}")
+            rows.append((env, num_envs, *answer.last_json()))
     on_gpu = jax.default_backend() != "cpu"
     print_table(("task", "num_envs", "of it: replay ring", *(("JAX, peak", "Warp, peak") if on_gpu else ("peak",))), rows)
 
 
 if __name__ == "__main__":
-    apart.main(measure, main)
+    if sys.argv[1:2] == [MEASURE]:
+        print(json.dumps(measure(*sys.argv[2:])))
+    else:
+        main()

@@ -15,14 +15,15 @@ from __future__ import annotations
 import argparse
 import concurrent.futures
 import dataclasses
+import gzip
 import itertools
+import json
 import statistics
 import sys
 import tempfile
 from pathlib import Path
 
 import jax
-from profile_epoch import busy, device_events
 from timing import print_table
 
 from mjx_dher import config as config_lib
@@ -81,6 +82,28 @@ class Case:
         """Transitions per second that updates learn from, of all runs."""
         config = self.spec.config
         return self.runs * config.cycles_per_epoch * config.updates_per_cycle * config.batch_size / self.seconds
+
+
+def device_events(folder: Path):
+    """(name, start, duration), both in µs, of the first GPU's activities."""
+    (path,) = folder.rglob("*.trace.json.gz")
+    trace = json.loads(gzip.decompress(path.read_bytes()))["traceEvents"]
+    names = {e["pid"]: e["args"]["name"] for e in trace if e.get("name") == "process_name"}
+    lines = {(e["pid"], e["tid"]): e["args"]["name"] for e in trace if e.get("name") == "thread_name"}
+    for event in trace:
+        if event.get("ph") != "X" or not names.get(event["pid"], "").endswith("GPU:0"):
+            continue
+        if lines.get((event["pid"], event["tid"]), "").startswith("Stream"):
+            yield event["name"], event["ts"], event["dur"]
+
+
+def busy(events) -> float:
+    """µs in which at least one of the events was running."""
+    total, end = 0.0, -1.0
+    for _, start, duration in sorted(events, key=lambda event: event[1]):
+        total += max(0.0, start + duration - max(end, start))
+        end = max(end, start + duration)
+    return total
 
 
 def compile_all(*arguments):
