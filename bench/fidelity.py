@@ -44,9 +44,9 @@ FALLS = 1000  # episodes in which fallen pucks are counted
 PUCK_SPEED, FRICTION, GRAVITY = 0.5, 0.1, 9.81  # m/s, -, m/s^2
 
 
-def load(task):
-    """Recorded episodes. bench/record_fetch.py documents the arrays."""
-    with np.load(DATA / f"fetch_{task}.npz") as file:
+def load(name):
+    """Recorded episodes of tests/data. bench/record_fetch.py and bench/fidelity_hand.py document the arrays."""
+    with np.load(DATA / f"{name}.npz") as file:
         return {name: file[name] for name in file.files}
 
 
@@ -160,22 +160,20 @@ def report(tasks, engines):
 
     from mjx_dher import envs
 
-    recorded = {task: load(task) for task in tasks}
+    recorded = {task: load(f"fetch_{task}") for task in tasks}
     paths = {
         (task, engine): replay(envs.make(task, engine=engine, **OPTIONS.get(engine, {})), recorded[task])
         for task in tasks
         for engine in engines
     }
-    with open(YARDSTICK, encoding="utf-8") as file:
-        original = [tuple(row) for row in csv.reader(file) if row[2] == run_by(SHIFTS[-1])]
-    rows = []
+    originals, rows = moved_originals(YARDSTICK), []
     for task in tasks:
         for kind, name in enumerate(KINDS):
             of = recorded[task]["policy"] == kind
             for engine in engines:
                 grip, obj = paths[task, engine]
                 rows.append((task, name, engine, *figures(recorded[task], grip[of], obj[of][:, [0, -1]], of)))
-            rows += [row for row in original if row[:2] == (task, name)]
+            rows += [row for row in originals if row[:2] == (task, name)]
     with contextlib.redirect_stdout(io.StringIO()) as text:
         print_table(HEAD, rows)
         if "slide" in tasks and set(ENGINES) <= set(engines):
@@ -241,6 +239,24 @@ def run_by(shift):
     return f"original, moved {1e3 * shift:.1f} mm"
 
 
+def moved_originals(path):
+    """Rows of a yardstick's file with the larger of SHIFTS."""
+    with path.open(encoding="utf-8") as file:
+        return [tuple(row) for row in csv.reader(file) if row[2] == run_by(SHIFTS[-1])]
+
+
+def make_original(task):
+    """The original task, in an environment that has it."""
+    import gymnasium
+    import gymnasium_robotics
+
+    from mjx_dher.tools.transfer import ORIGINALS
+
+    warnings.filterwarnings("ignore")
+    gymnasium.register_envs(gymnasium_robotics)
+    return gymnasium.make(ORIGINALS[task]).unwrapped
+
+
 def replay_original(env, recorded, shift, rng):
     """Grip [E, T+1, 3] and the object's first and last position [E, 2, 3] in m, in the original itself.
 
@@ -268,19 +284,12 @@ def replay_original(env, recorded, shift, rng):
 
 def yardstick():
     """Writes the report's numbers for the originals, replayed from starts moved by SHIFTS."""
-    import gymnasium as gym
-    import gymnasium_robotics
-
-    from mjx_dher.tools.transfer import ORIGINALS
-
-    warnings.filterwarnings("ignore")
-    gym.register_envs(gymnasium_robotics)
     rng = np.random.default_rng(0)
     with open(YARDSTICK, "w", encoding="utf-8", newline="") as file:
         out = csv.writer(file)
         out.writerow(HEAD)
         for task in TASKS:
-            env, recorded = gym.make(ORIGINALS[task]).unwrapped, load(task)
+            env, recorded = make_original(task), load(f"fetch_{task}")
             for shift in SHIFTS:
                 runs = [replay_original(env, recorded, shift, rng) for _ in range(DIRECTIONS if shift else 1)]
                 grip, ends = (np.concatenate(parts) for parts in zip(*runs))

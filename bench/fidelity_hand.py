@@ -32,15 +32,11 @@ import contextlib
 import csv
 import io
 import sys
-import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from fidelity import put_into_document, run_by
+from fidelity import DATA, DIRECTIONS, OPTIONS, SHIFTS, load, make_original, moved_originals, put_into_document, run_by
 
-ROOT = Path(__file__).parent.parent
-DATA = ROOT / "tests" / "data"
 YARDSTICK = DATA / "hand_yardstick.csv"
 BEGIN, END = "<!-- hands: begin -->", "<!-- hands: end -->"
 
@@ -50,8 +46,6 @@ RESETS = 200
 EPISODES = 15  # of each task, in turn of each kind
 KEPT = 10  # steps between kept states
 JOINTS = 24
-OPTIONS = {"warp": {"allow_cpu": True}}
-SHIFTS, DIRECTIONS = (0.0, 1e-4), 4
 # Errors are those at these times and, of the joints, the mean over the episode.
 HEAD = (
     "task",
@@ -67,12 +61,6 @@ HEAD = (
     "at the end",
     "in hand agrees",
 )
-
-
-def load(task):
-    """The recorded episodes of a task."""
-    with np.load(DATA / f"hand_{task}.npz") as file:
-        return {name: file[name] for name in file.files}
 
 
 def actions_of(recorded):
@@ -150,12 +138,9 @@ def report(tasks, engines, episodes, steps):
 
     from mjx_dher import envs
 
-    with open(YARDSTICK, encoding="utf-8") as file:
-        original = [tuple(row) for row in csv.reader(file) if row[2] == run_by(SHIFTS[-1])]
-    rows = []
+    originals, rows = moved_originals(YARDSTICK), []
     for task in tasks:
-        recorded = load(task)
-        paths = {}
+        recorded, paths = load(f"hand_{task}"), {}
         for engine in engines:
             try:
                 env: Any = envs.make(task, engine=engine, **OPTIONS.get(engine, {}))
@@ -168,7 +153,7 @@ def report(tasks, engines, episodes, steps):
             of = np.flatnonzero(recorded["kind"][:episodes] == kind)
             if len(of):
                 rows += [(task, name, engine, *figures(recorded, path[of], of)) for engine, path in paths.items()]
-            rows += [row for row in original if row[:2] == (task, name)]
+            rows += [row for row in originals if row[:2] == (task, name)]
     with contextlib.redirect_stdout(io.StringIO()) as text:
         print_table(HEAD, rows)
     return text.getvalue().strip()
@@ -177,23 +162,12 @@ def report(tasks, engines, episodes, steps):
 # The originals.
 
 
-def original(task):
-    """The original task, and the indices of the coordinates it shares with ours (the others belong to the drawn target)."""
-    import gymnasium
-    import gymnasium_robotics
-
-    from mjx_dher.tools.transfer import ORIGINALS
-
-    warnings.filterwarnings("ignore")
-    gymnasium.register_envs(gymnasium_robotics)
-    return gymnasium.make(ORIGINALS[task]).unwrapped, (JOINTS, JOINTS) if task == "hand_reach" else (JOINTS + 7, JOINTS + 6)
-
-
 def record(seed=0):
     """Writes tests/data/hand_TASK.npz."""
     for task in TASKS:
-        (env, (nq, nv)), rng = original(task), np.random.default_rng(seed)
-        steps = 50 if task == "hand_reach" else 100
+        env, rng = make_original(task), np.random.default_rng(seed)
+        # Coordinates that the original shares with ours. Its others belong to the drawn target.
+        steps, nq, nv = (50, JOINTS, JOINTS) if task == "hand_reach" else (100, JOINTS + 7, JOINTS + 6)
         episodes = []
         for index in range(EPISODES):
             kind = index % len(KINDS)
@@ -244,7 +218,7 @@ def yardstick():
         out = csv.writer(file)
         out.writerow(HEAD)
         for task in TASKS:
-            env, recorded = original(task)[0], load(task)
+            env, recorded = make_original(task), load(f"hand_{task}")
             for shift in SHIFTS:
                 runs = DIRECTIONS if shift else 1
                 paths = np.concatenate([replay_original(env, recorded, shift, rng) for _ in range(runs)])

@@ -13,7 +13,6 @@ import json
 import os
 import subprocess
 import time
-import warnings
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
@@ -30,15 +29,10 @@ def rates(play, steps):
 
 def original(task):
     """Prints the rates of the original, which this process plays."""
-    import gymnasium
-    import gymnasium_robotics
     import numpy as np
+    from fidelity import make_original
 
-    from mjx_dher.tools.transfer import ORIGINALS
-
-    warnings.filterwarnings("ignore")
-    gymnasium.register_envs(gymnasium_robotics)
-    env = gymnasium.make(ORIGINALS[task]).unwrapped
+    env = make_original(task)
     length, rng = 50 if task == "hand_reach" else 100, np.random.default_rng(0)
     env.reset(seed=0)
 

@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import argparse
 import ast
-import warnings
 from pathlib import Path
 from typing import Any
 
+import fidelity
 import mujoco
 import numpy as np
 
@@ -185,17 +185,12 @@ def rows_of_start(env, numbers):
 
 
 def read(tasks):
-    warnings.filterwarnings("ignore")
-    import gymnasium as gym
-    import gymnasium_robotics
-
     from mjx_dher.tools.transfer import ORIGINALS
 
-    gym.register_envs(gymnasium_robotics)
     np.set_printoptions(precision=7, suppress=True, linewidth=200, threshold=60)
     largest: dict[str, dict[str, float]] = {}
     for task in tasks:
-        env: Any = gym.make(ORIGINALS[task]).unwrapped
+        env: Any = fidelity.make_original(task)
         numbers, here = task_numbers(task), our_model(task)
         env.reset(seed=0)
         there, here_data = env.model, settle(here, numbers)
@@ -299,8 +294,7 @@ def errors(scale, recorded):
 
 def load(task, part):
     """Every second scripted episode, with noise and without, starting from the first (`part` 0) or the second (1)."""
-    with np.load(ROOT / "tests" / "data" / f"fetch_{task}.npz") as file:
-        data = {name: file[name] for name in file.files}
+    data = fidelity.load(f"fetch_{task}")
     rows = np.concatenate([np.flatnonzero(data["policy"] == kind)[part::2] for kind in (1, 2)])
     return {name: array[rows] for name, array in data.items()}
 
