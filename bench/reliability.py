@@ -17,7 +17,6 @@ import json
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 import time
@@ -39,15 +38,13 @@ from mjx_dher import Config, HParams, envs, make_train
 from mjx_dher.runs import loop
 from mjx_dher.runs.folder import checkpoint, restoring, run_folder
 
-ROOT = Path(__file__).parent.parent
 # A ring that takes a tenth of a second to save, so that kills meet saves.
 SHAPES: dict[str, Any] = {"num_envs": 2, "cycles_per_epoch": 1, "updates_per_cycle": 2, "target_period": 1, "batch_size": 16}
 SHAPES |= {"hidden_sizes": (8, 8), "replay_size": 50_000, "eval_episodes": 2}
 EPOCHS = 400
 INTERVAL = 2  # epochs between checkpoints
-BESIDE = {**reliability_splices.PARTS, **reliability_machines.PARTS, **reliability_hostile.PARTS}
 PARTS = ["kills", "flips", "damage", "disk", "twice", "pairs", "power", "edits", "calls", "messages", "signals"]
-PARTS += BESIDE
+PARTS += ["splices", "disks", "containers", "hostile"]
 
 
 class Failure(Exception):
@@ -89,10 +86,7 @@ class Runs:
                 command += ["--" + name.replace("_", "-"), *value]
             numbers = HParams()._asdict()
             command += [str(x) for name, value in numbers.items() for x in ("--" + name.replace("_", "-"), value)]
-        command = [sys.executable, "-u", "train.py", *map(str, command)]
-        if limit is not None:
-            command = ["bash", "-c", f'ulimit -f {limit}; exec "$@"', "bash", *command]
-        return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        return reliability_pairs.start(*command, limit=limit)
 
     def check(self, out, lost=INTERVAL):
         """The epoch restored from `out`, or 0 if there is no checkpoint. At most `lost` epochs were done after it."""
@@ -240,60 +234,29 @@ def expect_none(faults):
     expect(not faults, f"{len(faults)} faults ({counts})")
 
 
-def pairs(args, folder):
-    """Two programs on one folder."""
-    expect_none(reliability_pairs.pairs(folder, args.pairs, random.Random(args.seed), args.workers))
-    return (
-        f"{args.pairs} pairs of programs on one folder",
-        "one goes on, the other is refused or takes other work; right tables",
-    )
-
-
-def power(args, folder):
-    """Power cuts."""
-    faults, lost = reliability_power.power(folder, args.power, random.Random(args.seed), args.workers)
-    expect_none(faults)
-    return (
-        f"{args.power} power cuts: what was not flushed is gone, or half there",
-        f"at most {lost} epochs lost, of 5 between checkpoints",
-    )
-
-
-def edits(args, folder):
-    """Edits of config.json."""
-    tried, faults = reliability_calls.edits(folder)
-    expect_none(faults)
-    return f"{tried} edits of config.json, then resume, eval or plot", "each refused by name, told, or without effect"
-
-
-def calls(args, folder):
-    """Wrong calls."""
-    tried, faults = reliability_calls.calls(folder)
-    expect_none(faults)
-    return f"{tried} wrong calls of the command line", "each a sentence and status 2; nothing written, no traceback"
-
-
-def beside(args, folder):
-    """Splices, disks and containers."""
-    tried, outcome, faults = BESIDE[folder.name](folder)
-    expect_none(faults)
-    return tried, outcome
-
-
-def messages(args, folder):
+def messages(folder, args):
     """Hostile messages to every port."""
     import reliability_messages  # which needs the extras view and ray
 
     ports, faults = reliability_messages.messages(folder, args.messages, args.seed)
-    expect_none(faults)
-    return f"{args.messages} hostile messages to each of {ports} ports", "nothing ended or blocked; a browser still served"
+    done = f"{args.messages} hostile messages to each of {ports} ports"
+    return done, "nothing ended or blocked; a browser still served", faults
 
 
-def signals(args, folder):
-    """Signals to each of four commands."""
-    outcome, faults = reliability_signals.signals(folder, args.signals, args.seed, args.workers)
-    expect_none(faults)
-    return f"{args.signals} SIGINTs, SIGTERMs and SIGHUPs at random moments of each command", outcome
+def parts_apart(args):
+    """Parts that have their own runs: functions of a folder that return what was done, what came of it, and the faults."""
+    return {
+        "pairs": lambda folder: reliability_pairs.pairs(folder, args.pairs, random.Random(args.seed), args.workers),
+        "power": lambda folder: reliability_power.power(folder, args.power, random.Random(args.seed), args.workers),
+        "edits": reliability_calls.edits,
+        "calls": reliability_calls.calls,
+        "messages": lambda folder: messages(folder, args),
+        "signals": lambda folder: reliability_signals.signals(folder, args.signals, args.seed, args.workers),
+        "splices": reliability_splices.splices,
+        "disks": reliability_machines.disks,
+        "containers": reliability_machines.containers,
+        "hostile": reliability_hostile.hostile,
+    }
 
 
 def main() -> int:
@@ -305,15 +268,15 @@ def main() -> int:
     parser.add_argument("--env", default="reach")
     args = parser.parse_args()
     parts = {"kills": kills, "flips": flips, "damage": damage, "disk": disk, "twice": twice}
-    by_itself = {"pairs": pairs, "power": power, "edits": edits, "calls": calls, "messages": messages, "signals": signals}
-    by_itself |= dict.fromkeys(BESIDE, beside)
+    apart = parts_apart(args)
     rows, failed = [], False
     with tempfile.TemporaryDirectory() as folder:
-        runs = Runs(args.env, folder) if set(args.parts) - set(by_itself) else None
+        runs = Runs(args.env, folder) if set(args.parts) - set(apart) else None
         for name in args.parts:
             try:
-                if name in by_itself:
-                    texts = by_itself[name](args, Path(folder, name))
+                if name in apart:
+                    *texts, faults = apart[name](Path(folder, name))
+                    expect_none(faults)
                 else:
                     texts = parts[name](runs, getattr(args, name, 0), random.Random(args.seed))
                 rows.append((name, *texts, "yes"))

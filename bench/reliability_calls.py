@@ -85,7 +85,8 @@ def edits(folder):
                 if fault:
                     shown = "removed" if other is REMOVED else repr(other)
                     faults.append(f"{command(copy)[0]}, {'.'.join(path)} {shown}: {fault}")
-    return tried, faults
+    done = f"{tried} edits of config.json, then resume, eval or plot"
+    return done, "each refused by name, told, or without effect", faults
 
 
 def stop_after(epochs, spec, folder):
@@ -147,7 +148,7 @@ def silent(kind, field, text, folder, right):
 
 
 def calls(folder):
-    """All wrong calls of tests/wrong_calls.py, in an empty folder. Returns their number and the faults."""
+    """All wrong calls of tests/wrong_calls.py, in an empty folder."""
     import wrong_calls
 
     folder.mkdir()
@@ -173,7 +174,8 @@ def calls(folder):
                     faults.append(f"{shown(arguments)}: status {status}: {text[-200:]}")
             if names := differing(before, everything(folder)):
                 faults.append(f"{shown(arguments)}: written or changed: {', '.join(names[:3])}")
-    return len(wrong), faults
+    done = f"{len(wrong)} wrong calls of the command line"
+    return done, "each a sentence and status 2; nothing written, no traceback", faults
 
 
 def call_apart(*arguments):

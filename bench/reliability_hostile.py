@@ -308,7 +308,7 @@ def faults_of(case, status):
 
 
 def hostile(folder, count=200, seed=0):
-    """Makes and opens `count` cases. Returns the action, a summary and the faults."""
+    """Makes and opens `count` cases."""
     sys.path[:0] = [str(ROOT / "docs" / "examples"), ""]
     rng, base, ended, faults = random.Random(seed), folder / "base", dict[int | None, int](), []
     make_base(base)
@@ -323,8 +323,6 @@ def hostile(folder, count=200, seed=0):
     done = f"{count} folders that name code, link elsewhere or are damaged, opened by {len(COMMANDS)} commands"
     return done, f"no code ran; {ended.get(2, 0)} errors with status 2, {ended.get(0, 0)} without effect", faults
 
-
-PARTS = {"hostile": hostile}
 
 if __name__ == "__main__":
     for line in hostile(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])):

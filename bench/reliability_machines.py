@@ -122,19 +122,8 @@ def containers(folder):
         (folder / f"{number}.groups").write_text(groups)
 
         def inside(*command, tree=tree):
-            wrapped = [
-                "unshare",
-                "-m",
-                "bash",
-                "-c",
-                INSIDE,
-                "bash",
-                tree,
-                tree.with_suffix(".groups"),
-                sys.executable,
-                *command,
-            ]
-            return subprocess.run(wrapped, cwd=ROOT, capture_output=True, text=True, check=False)
+            container = ["unshare", "-m", "bash", "-c", INSIDE, "bash", tree, tree.with_suffix(".groups")]
+            return subprocess.run([*container, sys.executable, *command], cwd=ROOT, capture_output=True, text=True, check=False)
 
         free, usable = map(int, inside("-c", ASK).stdout.split())
         if not 0.95 * min(most, free) <= free <= most or usable > cores:
@@ -147,6 +136,3 @@ def containers(folder):
         "memory and cores are those of the container; a run that does not fit is refused",
         faults,
     )
-
-
-PARTS = {"disks": disks, "containers": containers}

@@ -27,8 +27,11 @@ SWEEP = ["sweep", *SHAPES, "--total-steps", "1000", "--sampler", "future", "weig
 TIMES = ("wall_seconds", "steps_per_second", "updates_per_second", "memory_bytes")
 
 
-def start(*arguments):
+def start(*arguments, limit=None):
+    """The command. `limit`: largest size of a file in kB."""
     command = [sys.executable, "-u", "train.py", *map(str, arguments)]
+    if limit is not None:
+        command = ["bash", "-c", f'ulimit -f {limit}; exec "$@"', "bash", *command]
     return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
@@ -196,4 +199,9 @@ def pairs(folder, count, rng, workers):
     with ThreadPoolExecutor(workers) as pool:
         found = list(pool.map(run, range(count)))
     named = [(f"pair {number}, {kinds[number % 4][0].__name__}", faults) for number, faults in enumerate(found)]
-    return [f"{name}: {fault}" for name, faults in named for fault in faults]
+    faults = [f"{name}: {fault}" for name, faults in named for fault in faults]
+    return (
+        f"{count} pairs of programs on one folder",
+        "one goes on, the other is refused or takes other work; right tables",
+        faults,
+    )

@@ -21,19 +21,8 @@ from mjx_dher.runs.folder import results, run_folder
 
 INTERVAL = 5  # epochs between checkpoints
 TRAIN = [*SHAPES, "--total-steps", "3000", "--checkpoint-every", str(INTERVAL)]  # 150 epochs
-SWEEP = [
-    "sweep",
-    *SHAPES,
-    "--total-steps",
-    "1000",
-    "--sampler",
-    "future",
-    "weighted",
-    "--seeds",
-    "2",
-    "--checkpoint-every",
-    "5",
-]
+SWEEP = ["sweep", *SHAPES, "--total-steps", "1000", "--sampler", "future", "weighted", "--seeds", "2"]
+SWEEP += ["--checkpoint-every", str(INTERVAL)]
 RECORDED = """
 import sys
 from pathlib import Path
@@ -106,7 +95,7 @@ def sweep_cut(folder, right, rng, disk_rng, lanes):
 
 
 def power(folder, count, rng, workers):
-    """Two of three are runs, the others sweeps of one lane and of two. Returns the faults, and the most epochs lost."""
+    """Two of three are runs, the others sweeps of one lane and of two."""
     folder.mkdir()
     faults_of(start(*TRAIN, "--out", folder / "right"), (0,))
     right = of_run(folder / "right")
@@ -125,4 +114,8 @@ def power(folder, count, rng, workers):
 
     with ThreadPoolExecutor(workers) as pool:
         found = list(pool.map(run, range(count)))
-    return [f"cut {number}: {fault}" for number, (faults, _) in enumerate(found) for fault in faults], max(x for _, x in found)
+    return (
+        f"{count} power cuts: what was not flushed is gone, or half there",
+        f"at most {max(lost for _, lost in found)} epochs lost, of {INTERVAL} between checkpoints",
+        [f"cut {number}: {fault}" for number, (faults, _) in enumerate(found) for fault in faults],
+    )

@@ -170,8 +170,8 @@ def _marked(mark: str) -> list[str]:
     return found
 
 
-def signals(folder: Path, count: int, seed: int, workers: int = 1) -> tuple[str, list[str]]:
-    """Sends `count` signals to each command. Returns a summary and the faults."""
+def signals(folder: Path, count: int, seed: int, workers: int) -> tuple[str, str, list[str]]:
+    """Sends `count` signals to each command."""
     folder.mkdir(parents=True)
     names = [name for name in COMMANDS if name != "ray" or importlib.util.find_spec("ray")]
 
@@ -184,4 +184,5 @@ def signals(folder: Path, count: int, seed: int, workers: int = 1) -> tuple[str,
     with ThreadPoolExecutor(workers) as pool:
         done = list(pool.map(every, names))
     told = "; ".join(f"{x.name} {x.stopped} stopped, {x.ended} ended, {max(x.seconds, default=0):.1f} s at most" for x in done)
-    return told, [fault for trials in done for fault in trials.faults]
+    sent = f"{count} SIGINTs, SIGTERMs and SIGHUPs at random moments of each command"
+    return sent, told, [fault for trials in done for fault in trials.faults]

@@ -119,6 +119,3 @@ def outcome_of(command, kind, copy, runs):
         seen = text.replace(str(copy), ""), right["eval"][kind].replace(str(runs["mine"][kind]), "")
         return status, "" if seen[0] == seen[1] else f"silent: another evaluation: {text[-200:]}"
     return status, "" if rows(copy / "metrics.csv") == right["rows"][kind] else "silent: the curve of another run"
-
-
-PARTS = {"splices": splices}
