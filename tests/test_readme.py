@@ -38,11 +38,6 @@ def test_the_two_commands_are_what_ci_installs_and_runs():
     assert "\npytest" in ci
 
 
-def test_the_picture_of_the_design_is_what_its_script_draws():
-    figure = runpy.run_path(str(ROOT / "docs" / "make_design_figure.py"))["make"]()
-    assert figure == (ROOT / "docs" / "images" / "design.svg").read_text()
-
-
 def test_the_picture_of_samplers_has_the_numbers_of_the_tables():
     """Its curves, averaged over epochs, are the mean successes of docs/results.md."""
     figure = runpy.run_path(str(ROOT / "docs" / "make_readme_figure.py"))
