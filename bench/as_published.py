@@ -39,8 +39,11 @@ def _arms(*names: str) -> tuple[Arm, ...]:
     return tuple(_BY_NAME[name] for name in names)
 
 
-def _workers(number: int, batch: int, cycles: int, epochs: int, task: str, arm: Arm, toy: bool) -> RunSpec:
+def _workers(
+    number: int, batch: int, cycles: int, epochs: int, learner: str, task: str, arm: Arm, toy: bool = False
+) -> RunSpec:
     """Run with openai/baselines' settings, which both authors use: two episodes for each of `number` workers."""
+    del learner
     run = presets.preset("paper", task, networks="mlp", **arm.parts)
     steps = 2 * number * 50 * cycles * epochs
     sizes = {"num_envs": 2 * number, "batch_size": number * batch, "cycles_per_epoch": cycles}
@@ -49,16 +52,10 @@ def _workers(number: int, batch: int, cycles: int, epochs: int, task: str, arm: 
     return dataclasses.replace(run, config=config, hparams=run.hparams._replace(**numbers))
 
 
-def cher(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
-    """Run of FetchReach as in the README of CHER's code, with one worker. Success is 1 after 4,000 steps."""
-    del learner
-    return _workers(1, 64, 2, 20, task, arm, toy)
-
-
-def ebp(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
-    """Run of PickAndPlace as in the README of EBP's code: 19 workers, 50 epochs of 50 cycles."""
-    del learner
-    return _workers(19, 256, 50, 50, task, arm, toy)
+# FetchReach as in the README of CHER's code, with one worker. Success is 1 after 4,000 steps.
+cher = functools.partial(_workers, 1, 64, 2, 20)
+# PickAndPlace as in the README of EBP's code: 19 workers, 50 epochs of 50 cycles.
+ebp = functools.partial(_workers, 19, 256, 50, 50)
 
 
 def next_future(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:

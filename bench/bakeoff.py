@@ -14,7 +14,6 @@ docs/experiments/bakeoff.md has the plan.
 from __future__ import annotations
 
 import argparse
-import csv
 import dataclasses
 import math
 import sys
@@ -204,10 +203,7 @@ def report(args: argparse.Namespace, console: Console) -> int:
     files.make_folder(args.out)
     save(args.out / args.experiment.runs, runs)
     console.print(f"wrote {args.out / args.experiment.runs}, {len(runs)} runs")
-    with files.atomic_write(args.out / args.experiment.table) as partial, partial.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(Row._fields[:-1])  # without the seeds' differences, which `runs` has
-        writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row[:-1]] for row in rows)
+    save(args.out / args.experiment.table, [row[:-1] for row in rows], Row._fields[:-1])  # `runs` has the seeds' differences
     console.print(f"wrote {args.out / args.experiment.table}")
     for task in args.tasks:
         if shown := [row for row in rows if row.task == task]:

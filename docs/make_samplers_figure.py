@@ -10,7 +10,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
-from paper_analysis import DOCS, with_tables
+from paper_analysis import DOCS, table, with_tables
 
 from mjx_dher import HParams, samplers
 
@@ -60,16 +60,10 @@ def rows() -> list[tuple[str, list[float]]]:
     return [(name, [total_variation(sampler, d) for d in SITUATIONS.values()]) for name, sampler in made.items()]
 
 
-def table() -> str:
-    """The table as Markdown."""
-    lines = [f"| normalization, kernel | {' | '.join(SITUATIONS)} |", "|---|" + "---|" * len(SITUATIONS)]
-    lines += [f"| {name} | {' | '.join(f'{value:.3f}' for value in values)} |" for name, values in rows()]
-    return "\n".join(lines)
-
-
 def with_table(page: str) -> str:
     """The page's text with the current table."""
-    return with_tables(page, SCRIPT, {"readings": table()})
+    lines = [[name, *(f"{value:.3f}" for value in values)] for name, values in rows()]
+    return with_tables(page, SCRIPT, {"readings": table(" | ".join(["normalization, kernel", *SITUATIONS]), lines)})
 
 
 def draw(path: Path) -> None:

@@ -19,7 +19,6 @@ DOCS = Path(__file__).parent
 NAMES = {"push": "Push", "pick_and_place": "PickAndPlace", "slide": "Slide"}
 THRESHOLDS = {"push": 0.9, "pick_and_place": 0.9, "slide": 0.6}
 LAST = {"push": 10, "pick_and_place": 10, "slide": 20}  # epochs that count as the long term
-STEPS = {"push": 40_000, "pick_and_place": 80_000, "slide": 40_000}  # per epoch
 START, MARGIN = 0.2, 0.02  # success at which a run has begun to learn; largest difference that counts as alike
 
 
@@ -86,10 +85,10 @@ def difference(a: NDArray, b: NDArray) -> Difference:
     return Difference(each, *t_interval(each), stats.paired_p_value(a, b))
 
 
-def gain(sweeps: Sweeps, sweep: str, setting: str, baseline: str, epochs: int | None = None) -> Difference:
+def gain(sweeps: Sweeps, sweep: str, setting: str, baseline: str) -> Difference:
     """Gain in mean success over the epochs of a setting against a baseline of the same sweep, paired by the setting's seeds."""
     own = sweeps[sweep, setting]
-    return difference(area(own, epochs), area(with_seeds(sweeps[sweep, baseline], own.seeds), epochs))
+    return difference(area(own), area(with_seeds(sweeps[sweep, baseline], own.seeds)))
 
 
 def with_seeds(curves: Curves, seeds: tuple[int, ...]) -> Curves:
