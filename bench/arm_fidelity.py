@@ -23,17 +23,8 @@ BODY = ("pos", "quat", "mass", "ipos")
 JOINT = ("type", "axis", "pos", "limited", "damping", "stiffness", "frictionloss")  # not armature: see envs/arms.py
 WHOLE = (
     *("gainprm", "biasprm", "ctrlrange", "forcerange", "gear", "ctrllimited", "forcelimited", "biastype", "dyntype"),
-    *(
-        "eq_data",
-        "eq_solref",
-        "eq_solimp",
-        "pair_dim",
-        "pair_friction",
-        "pair_solref",
-        "pair_solimp",
-        "pair_margin",
-        "pair_gap",
-    ),
+    *("eq_data", "eq_solref", "eq_solimp"),
+    *("pair_dim", "pair_friction", "pair_solref", "pair_solimp", "pair_margin", "pair_gap"),
 )
 
 

@@ -48,18 +48,9 @@ KEPT = 10  # steps between kept states
 JOINTS = 24
 # Errors are those at these times and, of the joints, the mean over the episode.
 HEAD = (
-    "task",
-    "actions",
-    "run by",
-    "joints, mrad: after 0.4 s",
-    "mean",
-    "object, mm: after 0.4 s",
-    "after 2 s",
-    "at the end",
-    "turn, rad: after 0.4 s",
-    "after 2 s",
-    "at the end",
-    "in hand agrees",
+    *("task", "actions", "run by", "joints, mrad: after 0.4 s", "mean"),
+    *("object, mm: after 0.4 s", "after 2 s", "at the end"),
+    *("turn, rad: after 0.4 s", "after 2 s", "at the end", "in hand agrees"),
 )
 
 

@@ -35,14 +35,8 @@ TINY = ("V_thbase", "V_thhub")  # boxes of 2 mm
 FAR = 0.4  # rad; distance of a tendon's limit that no joint can bridge
 # A cylinder of this radius with a blunt end, from 0.04 to 0.268 m; within 5 mm of the mesh from 0.04 to 0.26 m.
 FOREARM = 'fromto="0 0.01 0.1075 0 0.01 0.19" size="0.0675"'
-COLORS = (
-    "0.9 0.25 0.2 1",
-    "0.2 0.65 0.3 1",
-    "0.95 0.8 0.2 1",
-    "0.95 0.95 0.95 1",
-    "0.6 0.3 0.75 1",
-    "0.95 0.55 0.15 1",
-)  # marks
+# Colours of marks.
+COLORS = ("0.9 0.25 0.2 1", "0.2 0.65 0.3 1", "0.95 0.8 0.2 1", "0.95 0.95 0.95 1", "0.6 0.3 0.75 1", "0.95 0.55 0.15 1")
 SKIN, SHELL = "0.85 0.87 0.9 1", "0.35 0.37 0.42 1"
 
 

@@ -239,16 +239,11 @@ def print_runs(runs: Sequence[Run]) -> None:
         low, high = wilson_interval(sum(run.final_success), episodes)
         reached = next((f"{row['seconds']:.0f}" for row in run.rows if row["success_rate"] >= SUCCESS), "never")
         evaluating = f"{sum(row['evaluation'] for row in run.rows):.0f}" if "evaluation" in last else "in each epoch"
-        counts = (
-            f"{run.startup:.0f}",
-            f"{last['seconds']:.0f}",
-            evaluating,
-            f"{last['env_steps']:,.0f}",
-            f"{last['updates']:,.0f}",
-        )
+        times = (f"{run.startup:.0f}", f"{last['seconds']:.0f}", evaluating)
+        counts = (f"{last['env_steps']:,.0f}", f"{last['updates']:,.0f}")
         success = f"{sum(run.final_success) / episodes:.3f} ({low:.3f}-{high:.3f})"
         ends = (f"{last['success_rate']:.2f}", success, f"{sum(run.final_return) / episodes:.1f}")
-        rows.append((run.who, run.seed, *counts, reached, *ends))
+        rows.append((run.who, run.seed, *times, *counts, reached, *ends))
     head = ("who", "seed", "start-up, s", "s", "evaluations, s", "env steps", "updates", f"s to {SUCCESS:g}", "last success")
     print_table((*head, f"final success (95 %), {len(runs[0].final_success)} episodes", "mean return"), rows)
 

@@ -78,17 +78,8 @@ def main() -> None:
         print(rows[-1], flush=True)
         if args.out:
             save(args.out, curve, ("seed", "env_steps", "updates", "wall_seconds", "success_rate"))
-    head = (
-        f"s to {args.threshold}",
-        "env steps",
-        "updates",
-        "s in all",
-        "env steps in all",
-        "final success (95 %)",
-        "at reset",
-        "mean return",
-    )
-    print_table(("seed", *head), rows)
+    head = ("seed", f"s to {args.threshold}", "env steps", "updates", "s in all", "env steps in all")
+    print_table((*head, "final success (95 %)", "at reset", "mean return"), rows)
     times = [float(row[1]) if row[1] != "never" else float("inf") for row in rows]
     print(f"\nmedian seconds to {args.threshold}: {statistics.median(times):.0f}; compiling: {statistics.median(compiled):.1f}")
 
