@@ -250,6 +250,21 @@ def test_a_page_about_a_run_holds_all_that_it_shows(tmp_path, capsys):
     assert "out: /proc cannot be written to" in capsys.readouterr().err
 
 
+def test_a_page_with_a_new_video_leaves_the_video_as_it_was_drawn(tmp_path, monkeypatch, capsys):
+    run = write_run(tmp_path / "run")
+    real = cli.run
+
+    def draw(command, argv, console):
+        film = command == "render" and Path(argv[argv.index("--out") + 1])
+        return film.write_bytes(b"film") if film else real(command, argv, console)
+
+    monkeypatch.setattr(cli, "run", draw)
+    assert cli.main(["report", str(run), "--video"]) == 0
+    assert (run / "video.mp4").read_bytes() == b"film"
+    assert capsys.readouterr().out == f"wrote {run / 'report.html'}\n"
+    assert base64.b64encode(b"film").decode() in (run / "report.html").read_text()
+
+
 def test_a_page_about_a_run_that_failed_says_why_without_markup_of_its_own(tmp_path):
     spec = dataclasses.replace(SPEC, env="<b>:x")
     run = write_run(tmp_path / "run", status="failed", reason="<script>alert('x')</script> & more")

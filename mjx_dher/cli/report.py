@@ -133,8 +133,8 @@ def report_command(argv: list[str], console: Console) -> int:
     out = args.out or args.folder / report.REPORT
     settings.check_writable(out.parent)
     if args.video:
-        for run, out in _to_film(args.folder, sweep):
-            own = ("--out", str(out), "--episodes", str(EPISODES), "--overwrite", *(("--trust",) if args.trust else ()))
+        for run, video in _to_film(args.folder, sweep):
+            own = ("--out", str(video), "--episodes", str(EPISODES), "--overwrite", *(("--trust",) if args.trust else ()))
             cli.run("render", [str(run), *own], console)
     tell = console.print
     page = report.of_sweep(args.folder, args.baseline, args.threshold, tell) if sweep else report.of_run(args.folder, tell)
