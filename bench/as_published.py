@@ -7,7 +7,7 @@
     python bench/as_published.py test --out published/test                k of each method by the runs of `tune`
 
 Each is bench/bakeoff.py with other arms, and has its options. docs/experiments/as_published.md is the plan. `tune` writes
-tune_runs.csv; its copy docs/as_published_tune_runs.csv is what `test` reads.
+tune_runs.csv, and `test` reads its copy, docs/as_published_tune_runs.csv.
 """
 
 from __future__ import annotations

@@ -2,13 +2,13 @@
 
     python bench/paper.py --plan              # what would run
     python bench/paper.py samplers            # one figure: its sweeps, and its curves into docs/paper
-    python bench/paper.py k_push k_slide      # some sweeps of a figure, by name
+    python bench/paper.py k_push k_slide      # some sweeps of a figure
     python bench/paper.py all                 # all figures
     python docs/make_results_figures.py       # tables and pictures of docs/results.md from the curves
 
 A figure is one or more calls of `train.py sweep`, each with a separate folder under --out. It is meant for one GPU. Two GPUs
 share the work as `bench/paper.py samplers k` and `bench/paper.py slide readings ...` on one folder. `--toy` takes Reach, two
-seeds and sizes that a CPU trains in seconds, to test the mechanics; never for a figure.
+seeds and sizes that a CPU trains in seconds, to test the mechanics. Do not use it for a figure.
 """
 
 from __future__ import annotations

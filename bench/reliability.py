@@ -3,8 +3,8 @@
     python bench/reliability.py [--parts kills signals ...] [--kills 200] [--signals 50] [--flips 200] [--pairs 100]
 
 Every restored state is compared, by the SHA-256 of all its leaves, with the state of an undisturbed run. Every run or sweep
-that ends is compared with an undisturbed one. The table has one row per part. The exit status is 1 if a result differs in any
-bit, more than one interval between checkpoints was lost, or a refusal was not an error with a name. docs/reliability.md has
+that ends is compared with an undisturbed one. The table has one row per part. The exit status is 1 in three cases: a result
+differs in any bit, more than one interval between checkpoints was lost, or a refusal named no cause. docs/reliability.md has
 the results. `--workers` of `pairs`, `power` and `signals` run at a time.
 """
 
@@ -244,7 +244,7 @@ def messages(folder, args):
 
 
 def parts_apart(args):
-    """Parts that have their own runs: functions of a folder that return what was done, what came of it, and the faults."""
+    """Parts with their own runs: functions of a folder. Each returns a count of its trials, their outcome, and the faults."""
     return {
         "pairs": lambda folder: reliability_pairs.pairs(folder, args.pairs, random.Random(args.seed), args.workers),
         "power": lambda folder: reliability_power.power(folder, args.power, random.Random(args.seed), args.workers),

@@ -124,7 +124,7 @@ def without_key(leaf: Any) -> Any:
 
 
 def with_key(array: Array, like: Any) -> Array:
-    """Inverse of `without_key` for an array, or its shape, with the dtype of `like`."""
+    """Inverse of `without_key`: random keys from their data if `like`, an array or its shape, has keys, else the array."""
     return jax.random.wrap_key_data(array, impl=jax.random.key_impl(jnp.empty((), like.dtype))) if is_key(like) else array
 
 
