@@ -4,7 +4,7 @@
     python bench/td_controls.py --learners best --out td --first-seed 500 --seeds 20 --minutes 9   run it again to resume
     python bench/td_controls.py --out toy --toy --seeds 2                                          the point mass, on a CPU
 
-It is bench/bakeoff.py with other arms, and has its options. docs/experiments/as_published.md is the plan.
+It is bench/bakeoff.py with other arms, and has its options. docs/experiments/td_controls.md is the plan.
 """
 
 from __future__ import annotations

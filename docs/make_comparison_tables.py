@@ -68,7 +68,7 @@ PAGES = (
     ),
     Page(CONTRASTIVE, EXPERIMENTS / "crl.md", DOCS / "crl_runs.csv", "crl", pictures=False),
     Page(REWARDS, EXPERIMENTS / "crl_rewards.md", DOCS / "crl_rewards_runs.csv", "crl_rewards", pictures=False),
-    Page(CONTROLS, EXPERIMENTS / "as_published.md", DOCS / "td_controls_runs.csv", "td_controls", pictures=False, seeds=20),
+    Page(CONTROLS, EXPERIMENTS / "td_controls.md", DOCS / "td_controls_runs.csv", "td_controls", pictures=False, seeds=20),
     Page(HANDS, EXPERIMENTS / "preset_hands.md", DOCS / "hands_runs.csv", "hands", pictures=False),
     Page(THIRD, _REPEATS, DOCS / "bakeoff_third_runs.csv", "bakeoff_third", pictures=False, over_tasks=True),
 )

@@ -82,7 +82,7 @@ def test_numbers_are_those_of_the_pages_that_have_measured_them():
     results, bench, field = read("docs/results.md"), read("bench/README.md") + read("bench/peers.md"), read("docs/field.md")
     presets = read("docs/experiments/presets.md")
     measured = results + read("docs/experiments/paper_set.md") + read("docs/what_helps.md")
-    measured += read("docs/experiments/preset_hands.md") + read("docs/experiments/as_published.md")
+    measured += read("docs/experiments/preset_hands.md") + read("docs/experiments/td_controls.md")
     figures = re.findall(r"[+-]?\d\.\d{3}", section(README, "Results in four lines"))
     assert len(figures) > 20
     assert [figure for figure in figures if figure not in measured and f"+{figure}" not in measured] == []

@@ -188,13 +188,21 @@ def test_effects_of_the_tuned_methods():
         runs = {(row["task"], row["arm"], row["seed"]): float(row["mean_success"]) for row in csv.DictReader(file)}
     rows = [line for line in (ROOT / "docs" / "what_helps.md").read_text().splitlines() if line.startswith("| `")]
     tuned = {line.split("`")[1]: line.partition("k tuned for both")[2].lower() for line in rows}
-    tuned["energy_clipped"] = tuned.pop("energy")  # in one row
+    tuned |= {"energy_clipped": tuned["energy"], "dpp": tuned["diversity"]}  # in one row each
     for task, arm, said in (
         ("push", "next_future", "{loss:.3f}, not shown"),
         ("push", "energy_clipped", "loses {loss:.3f} on push"),
         ("slide", "energy_clipped", "and {loss:.3f} on slide"),
         ("push", "hgg", "by {loss:.3f} on push"),
-        ("slide", "archer", "gains {gain:.3f} on slide ({low:.3f} to {high:.3f})"),
+        ("pick_and_place", "hgg", "and {loss:.3f} on pickandplace"),
+        ("pick_and_place", "archer", "gains {gain:.3f} on pickandplace ({low:.3f} to {high:.3f})"),
+        ("slide", "archer", "{gain:.3f} on slide ({low:.3f} to {high:.3f})"),
+        ("push", "td_error", "gains {gain:.3f} on push ({low:.3f} to {high:.3f})"),
+        ("slide", "td_error", "on slide {gain:.3f} is not shown"),
+        ("push", "dpp", "loses {loss:.3f} on push"),
+        ("slide", "dpp", "and {loss:.3f} on slide"),
+        ("push", "curriculum", "loses {loss:.3f} on push"),
+        ("slide", "curriculum", "and {loss:.3f} on slide"),
     ):
         gains = np.array([runs[task, arm, str(seed)] - runs[task, "future", str(seed)] for seed in range(10, 20)])
         low, high = scipy.stats.t.interval(0.95, 9, gains.mean(), scipy.stats.sem(gains))
