@@ -10,8 +10,6 @@ ruff checks style, mypy types, and lint-imports the layers. This script checks t
 - prose that is hard to read, by prose.py (lower the limits as the tree improves)
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import math

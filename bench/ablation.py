@@ -10,8 +10,6 @@ It is bench/bakeoff.py with other arms, and has its options. Each arm is a separ
 the plan.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 from collections.abc import Callable

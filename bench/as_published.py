@@ -10,8 +10,6 @@ Each is bench/bakeoff.py with other arms, and has its options. docs/experiments/
 tune_runs.csv, and `test` reads its copy, docs/as_published_tune_runs.csv.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools

@@ -11,8 +11,6 @@ bakeoff_runs.csv has one row per run: `--runs FILE` resumes from it on a machine
 docs/experiments/bakeoff.md has the plan.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import math

@@ -1,7 +1,5 @@
 """Arms of bench/bakeoff.py: changes, claims, and the shared settings."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Comparison of bench/bakeoff.py's arms with the first of them: rows of a table, and forest plots."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Runs of bench/bakeoff.py as rows of a file, which suffices for the report without the runs' folders."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 from collections.abc import Iterable, Sequence

@@ -12,8 +12,6 @@ table (47 mm here), and its puck up to 45 mm. Slide on native exits with 1: in 2
 (bench/slams.md).
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import sys

@@ -8,8 +8,6 @@
 It is bench/bakeoff.py with other arms, and has its options. docs/experiments/crl.md is the plan, written before any run.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import sys

@@ -9,8 +9,6 @@ actor is ours in both, because JaxGCRL bounds standard deviations in another way
 whole batches.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import importlib.util
@@ -104,7 +102,7 @@ def theirs(
         critic_state: TrainState
         alpha_state: TrainState
 
-        def replace(self, **fields: Any) -> Training:
+        def replace(self, **fields: Any) -> "Training":
             return dataclasses.replace(self, **fields)
 
     def start(params: Any) -> TrainState:

@@ -11,8 +11,6 @@ docs/experiments/crl_jaxgcrl.md has the plan. JaxGCRL's tasks, learner and loop 
 because it needs metrics that arm tasks lack. wandb and the removed part of Brax are empty modules.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import os

@@ -10,8 +10,6 @@ ended, it plays each policy for 500 episodes (rewards_played.csv) and writes rew
 policies. docs/experiments/crl_rewards.md has the plan.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -11,8 +11,6 @@ run with and without varied physics, by random factors from 0.5 to 1.5. On a GPU
 numbers of threads for an environment, of warps in a block at most, and of constraint rows than it chooses.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import functools

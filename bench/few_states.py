@@ -8,8 +8,6 @@ the same `ctrl`. A cell has the loop's µs of one core's time for each state and
 `advance` are: medians of many short trials, which take turns in one process.
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
 import time

@@ -13,8 +13,6 @@ environment with an older MuJoCo, and writes tests/data/fetch_yardstick.csv:
     PYTHONPATH=. .fetch/bin/python bench/fidelity.py yardstick
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import csv

@@ -25,8 +25,6 @@ tests/data/hand_TASK.npz has E episodes of T steps, and every tenth state:
     goals   (R, G)             their goals
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import csv

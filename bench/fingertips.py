@@ -6,8 +6,6 @@ For each goal, least squares from eight postures minimize the distance of all fi
 servos are left out, so no policy comes nearer, unless all eight searches ended in local minima. docs/fidelity.md has results.
 """
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -12,8 +12,6 @@ have every trial exactly once, and the tables of the same sweep without Ray.
 `ray` is needed.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import random

@@ -5,8 +5,6 @@
 For the same without gymnasium, with a policy network, see throughput.py.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 

@@ -16,8 +16,6 @@ as pairs, so that MuJoCo does not search for geoms that are near. And 38 of 44 t
 their joints' limits keep them 0.4 rad away from it. Random extremes of the controls exceed a joint's limit by 0.04 rad at most.
 """
 
-from __future__ import annotations
-
 import textwrap
 from pathlib import Path
 

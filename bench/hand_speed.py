@@ -6,8 +6,6 @@ Both play whole episodes of random actions, resets included, and take turns. `--
 originals (bench/fidelity_hand.py). The rate for each second of one core's time does not depend on other programs.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

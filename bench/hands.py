@@ -7,8 +7,6 @@
 It is bench/bakeoff.py with other arms, and has its options. docs/experiments/preset_hands.md has the plan.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 

@@ -11,8 +11,6 @@ simplex from scipy, which JAX requires). It prints the errors before and after, 
 in envs/assets: `python bench/identify.py fit [--evaluations 150]`, some minutes.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 from pathlib import Path

@@ -9,8 +9,6 @@ until at least `--updates` are made, all in one program. Several seeds are one v
 seed. The last column is the time of a learner's gradients relative to ddpg, each per product.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 from typing import Any

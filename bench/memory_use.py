@@ -6,8 +6,6 @@ Each row is a separate program that trains one epoch of one cycle. On a GPU: the
 a CPU: the peak of the whole program.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource

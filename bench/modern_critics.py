@@ -8,8 +8,6 @@
 It is bench/bakeoff.py with other arms, and has its options. docs/experiments/ablation.md has the plan.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 from collections.abc import Callable

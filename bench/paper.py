@@ -11,8 +11,6 @@ share the work as `bench/paper.py samplers k` and `bench/paper.py slide readings
 seeds and sizes that a CPU trains in seconds, to test the mechanics. Do not use it for a figure.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import os

@@ -17,8 +17,6 @@ with the last policy in the original task, for both over the same --final-episod
 core, and transitions drawn by HerReplayBuffer. bench/throughput.py and bench/relabel.py print ours.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import csv

@@ -12,8 +12,6 @@ these tasks, so SAC takes the same numbers.
 # mypy: disable-error-code="import-not-found"
 # The peers are not installed where types are checked.
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

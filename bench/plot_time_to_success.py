@@ -4,8 +4,6 @@ python bench/plot_time_to_success.py docs/push_learning_curve.csv docs/push_lear
 python bench/plot_time_to_success.py --label environments docs/push_gpu/{512,2048,8192}.csv docs/push_gpu/num_envs.png
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import itertools

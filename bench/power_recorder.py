@@ -6,8 +6,6 @@ the content of its file, a length before the bytes. `rebuild` with random number
 aside, so that no inode number is reused.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

@@ -7,8 +7,6 @@ variation between the probabilities of the reading and of `future`: 0 means the 
 says that the sampler gives "a direction early on in training, while becoming more and more random as the network learns".
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 from pathlib import Path

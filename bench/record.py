@@ -11,8 +11,6 @@ with changes is an error, because the line would not describe the commit; with `
 --draw writes history.md and history.svg next to the file (extra `plot`).
 """
 
-from __future__ import annotations
-
 import argparse
 import datetime
 import json

@@ -6,8 +6,6 @@ Batches are drawn as in training, many at once. `--flashbax` adds a row for the 
 flashbax==0.1.3) with the same transitions and as many batches at once, drawn uniformly and not relabelled.
 """
 
-from __future__ import annotations
-
 import argparse
 
 import jax

@@ -8,8 +8,6 @@ differs in any bit, more than one interval between checkpoints was lost, or a re
 the results. `--workers` of `pairs`, `power` and `signals` run at a time.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import hashlib

@@ -1,7 +1,5 @@
 """Edits of every field of config.json, and several hundred wrong calls, most of them in this process."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -6,8 +6,6 @@
 run, or a sweep, of the point mass with one to three changes. All digests are forged so that they agree.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

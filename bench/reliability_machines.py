@@ -1,7 +1,5 @@
 """Limited machines: disks of six sizes, and four containers. Both need root for mounts in a private namespace."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

@@ -6,8 +6,6 @@ Needs the extras `view`, `ray` and `test`. Each program is the real command. Aft
 legitimate client of the viewer must still be served, and memory must not have grown.
 """
 
-from __future__ import annotations
-
 import argparse
 import asyncio
 import contextlib

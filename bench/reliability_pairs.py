@@ -3,8 +3,6 @@
 They start at random offsets, or one is stopped at a random moment of its start until the other has progressed.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import random

@@ -3,8 +3,6 @@
 After every other cut all unflushed data is lost. After the others some of it is kept at random.
 """
 
-from __future__ import annotations
-
 import random
 import re
 import signal

@@ -5,8 +5,6 @@ signals. The command must end within ten seconds with status 128 + signal, witho
 epoch without a checkpoint. The next trial resumes. Each run and sweep that ends is compared with an undisturbed one.
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import os

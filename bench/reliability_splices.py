@@ -1,7 +1,5 @@
 """Files of one run in the folder of another with the same code: lines of metrics, policies, results, checkpoints, configs."""
 
-from __future__ import annotations
-
 import shutil
 
 from reliability_calls import call, differing, everything, stop_after

@@ -10,8 +10,6 @@ are compiled first. The rows of a size are measured in turn, `--rounds` times, a
 adds an epoch of each row under jax.profiler: the shares of the first device's time in which it works, and exchanges.
 """
 
-from __future__ import annotations
-
 import argparse
 import concurrent.futures
 import dataclasses

@@ -11,8 +11,6 @@ blocks' medians. The exit status is 1 if anything compiled after the first epoch
 above zero, or if the environment steps per second, relative to the machine's speed, change by 5 % or more along the line.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import os

@@ -6,8 +6,6 @@ Each row is the command `python train.py` itself, for two epochs. It is "cold" i
 cached by JAX, Warp or the GPU's driver, and "warm" in the same one after that (medians).
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import statistics

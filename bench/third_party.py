@@ -7,8 +7,6 @@ Prints the largest distance of any coordinate from `mj_step` after each of these
 without a GPU.
 """
 
-from __future__ import annotations
-
 import argparse
 import warnings
 from typing import Any

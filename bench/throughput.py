@@ -9,8 +9,6 @@ measured. Hands, each case in less than a minute after kernels are compiled:
     python bench/throughput.py --env block_rotate_z --engines warp --path fused graph --num-envs 1024 8192 --random --repeats 2
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import time

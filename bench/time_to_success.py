@@ -7,8 +7,6 @@ Seconds are of training, with evaluations and without compilation. "First" is th
 or above the threshold. The final success is over 500 fresh episodes.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import statistics

@@ -1,7 +1,5 @@
 """Shared by the benchmarks: timing of compiled functions, and a table that names the machine."""
 
-from __future__ import annotations
-
 import platform
 import statistics
 import time

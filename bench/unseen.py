@@ -7,8 +7,6 @@ It is bench/bakeoff.py with a preset in place of a learner and one arm, and has 
 one row per seed. docs/experiments/presets.md has the table.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 

@@ -5,8 +5,6 @@ sweeps' folders. docs/bakeoff_repeat_runs.csv and docs/bakeoff_third_runs.csv ar
 third sweep. An arm is shown when all of its seeds have been run.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import sys

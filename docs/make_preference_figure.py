@@ -6,8 +6,6 @@ The strength is the share of draws that differ from `future` on the way to a goa
 success over 30 epochs of Push, paired over ten seeds (with the paper's cycles, `weighted` over twenty).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 Thin lines are seeds, thick ones their means. Red diamonds mark the gain that the paper reads off its single curves.
 """
 
-from __future__ import annotations
-
 import functools
 from typing import Any
 

@@ -4,8 +4,6 @@ A table's place in the page is between `<!-- NAME: docs/make_results_figures.py 
 from bench/paper.py (docs/paper/TASK_curves.csv), and from 2026-11-22 (docs/paper_TASK_curves.csv).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

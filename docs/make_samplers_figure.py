@@ -3,8 +3,6 @@
 The library's functions compute the weights of 25 goals after a step, given as distances in metres.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import jax.numpy as jnp

@@ -3,8 +3,6 @@
 The file has the rows of bench/scaling.py on one machine. `weak` has as many times the environments and the batch as devices.
 """
 
-from __future__ import annotations
-
 import csv
 from collections import defaultdict
 

@@ -1,7 +1,5 @@
 """Reads learning curves and compares them by seed, for the tables and pictures of the paper's experiment."""
 
-from __future__ import annotations
-
 import csv
 import math
 import re

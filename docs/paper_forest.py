@@ -1,7 +1,5 @@
 """The forest plots of the paper's experiment: `weighted` against `future` in every sweep, and the comparisons of the set."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

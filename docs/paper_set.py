@@ -4,8 +4,6 @@ A family is a question. p is corrected within it by Holm's method, and alternati
 least p of ten pairs is 2/1024, so a family of more than 25 comparisons could show nothing by Holm.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

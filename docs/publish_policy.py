@@ -4,8 +4,6 @@ Copies the run folder to mjx_dher/policy/bundled, under the name of its task, an
 policy here and, if the originals' environment is set up (`train.py transfer --set-up`), in the original task.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import datetime

@@ -1,7 +1,5 @@
 """Small settings that tests share, for the point mass, whose episodes have 10 steps."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from mjx_dher.config import Config

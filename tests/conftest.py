@@ -1,7 +1,5 @@
 """Fixtures shared by the tests; run from a checkout, installed or not."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import gc

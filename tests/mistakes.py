@@ -1,8 +1,6 @@
 """Parts as users get them wrong, each with a word of what it must be told. `test_mistakes` hands them to the checks and to
 `train`."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import jax

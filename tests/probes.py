@@ -1,7 +1,5 @@
 """Environments whose answers are known, a network and a batch that are followed by hand, and another program's lock."""
 
-from __future__ import annotations
-
 import contextlib
 
 import flax.linen as nn

@@ -1,7 +1,5 @@
 """The check of arrays."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Wrong calls of the command line, several hundred: each must end with status 2 and a sentence, and write nothing."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from pathlib import Path

@@ -3,8 +3,6 @@
 python docs/examples/own_episodes.py
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 

@@ -4,8 +4,6 @@ Each link, picture and anchor within the site must lead somewhere. In Chromium, 
 scroll sideways at the width of a phone, and the search must find pages without a server.
 """
 
-from __future__ import annotations
-
 import shutil
 import sys
 from collections.abc import Iterator

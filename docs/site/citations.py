@@ -1,7 +1,5 @@
 """Shows docs/joss/paper.md, which cites as Pandoc does, on the site: title, citations and references become Markdown."""
 
-from __future__ import annotations
-
 import re
 
 PAPER = "docs/joss/paper"

@@ -4,8 +4,6 @@ Pages are Markdown that is readable without Sphinx. This file builds the table o
 docstrings in place of the API pages' module lines, and converts docstrings from Markdown.
 """
 
-from __future__ import annotations
-
 import ast
 import functools
 import importlib

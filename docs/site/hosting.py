@@ -4,8 +4,6 @@ Each page gets a description and the tags of a link preview. The site gets a pag
 address is known (`html_baseurl`), `sitemap.xml`.
 """
 
-from __future__ import annotations
-
 from html import escape
 from pathlib import Path
 from typing import Any

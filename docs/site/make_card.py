@@ -1,7 +1,5 @@
 """Writes docs/site/static/card.png, the picture of link previews, from the README's pictures (extra `plot`)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import matplotlib

@@ -4,8 +4,6 @@ PUBLIC has a folder for each version, such as `PUBLIC/0.2.0`, which `.ci/run --d
 `versions.json`, from which every page lists the versions, and copies files that belong at the top from the newest version.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

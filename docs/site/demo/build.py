@@ -6,8 +6,6 @@ OUT gets the page, the policy as ONNX, the MJCF, the task's numbers, and MuJoCo,
 needs node and npm and, as `python train.py export` does, onnx. The folder OUT can be served by any web server.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
