@@ -1,4 +1,4 @@
-"""Where the numbers in envs/assets and envs/TASK.py come from, and whether fitting them to recordings would improve them.
+"""Where the numbers in envs/assets and envs/fetch.py come from, and whether fitting them to recordings would improve them.
 
 `read` prints the numbers of the original's compiled model and ours, then the largest difference in each quantity. It needs a
 separate virtual environment with an older MuJoCo:
@@ -28,10 +28,11 @@ FINGERS = ("r", "l")
 
 
 def task_numbers(task):
-    """The keywords of `FetchTask(...)` in envs/TASK.py, read without importing it (and JAX)."""
-    tree = ast.parse((ROOT / "envs" / f"{task}.py").read_text())
-    (call,) = (n for n in ast.walk(tree) if isinstance(n, ast.Call) and getattr(n.func, "id", "") == "FetchTask")
-    return {keyword.arg: ast.literal_eval(keyword.value) for keyword in call.keywords}
+    """The keywords of the task's `FetchTask(...)` in envs/fetch.py, read without importing it (and JAX)."""
+    tree = ast.parse((ROOT / "envs" / "fetch.py").read_text())
+    calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and getattr(n.func, "id", "") == "FetchTask"]
+    found = [{keyword.arg: ast.literal_eval(keyword.value) for keyword in call.keywords} for call in calls]
+    return next(numbers for numbers in found if numbers["xml"] == f"{task}.xml")
 
 
 def our_model(task):
@@ -170,7 +171,7 @@ def rows_of_actuators(there, here):
 
 
 def rows_of_start(env, numbers):
-    """Values marked as settled in envs/TASK.py, and the ranges of object and goal."""
+    """Values marked as settled in envs/fetch.py, and the ranges of object and goal."""
     joints = [env.data.joint(f"robot0:{name}_joint") for name in JOINTS]
     yield "settled angles, rad", "arm", [j.qpos[0] for j in joints], numbers["arm_qpos"]
     yield "settled rates, rad/s", "arm", [j.qvel[0] for j in joints], numbers["arm_qvel"]
