@@ -148,9 +148,6 @@ def forest(rows: Sequence[Row], path: Path, baseline: str) -> None:
     """Draws the paired differences of a task's arms from the baseline, with intervals and corrected p, one panel per
     learner.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     learners = list(dict.fromkeys(row.learner for row in rows))

@@ -68,9 +68,6 @@ def correlation(found: list[Point]) -> float:
 
 def draw(path: Path) -> None:
     """Draws the figure."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     figure, axis = plt.subplots(figsize=(8, 4.2), layout="constrained")

@@ -51,9 +51,6 @@ def _panel(axis: Any, task: str) -> None:
 
 def make() -> Any:
     """The figure."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 3, figsize=(12, 3.9), sharey=True, layout="constrained")

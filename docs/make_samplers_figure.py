@@ -66,9 +66,6 @@ def with_table(page: str) -> str:
 
 def draw(path: Path) -> None:
     """Draws the probability of a goal, relative to `future`, over its distance, for three situations."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     chosen = ("on the way", "at the goal", "solved")

@@ -49,9 +49,6 @@ def with_table(page: str) -> str:
 
 def draw() -> None:
     """Draws steps per second over devices, relative to one device."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     runs = read()

@@ -43,9 +43,6 @@ def epoch_lines(data: Mapping[str, Sweeps], names: tuple[str, ...]) -> list[Line
 
 def draw(data: Mapping[str, Sweeps], path: Path, main: tuple[str, ...]) -> None:
     """Draws the picture. The sweeps in `main` come first; the first one that a task has is darker."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(12, 6.2))
@@ -62,9 +59,6 @@ def draw(data: Mapping[str, Sweeps], path: Path, main: tuple[str, ...]) -> None:
 
 def draw_set(found: Mapping[str, list[Compared]], path: Path) -> None:
     """Draws every comparison of the set, one panel per task. Dark: p is below 0.05, corrected over its family."""
-    import matplotlib
-
-    matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     every = [result for results in found.values() for result in results]
