@@ -14,9 +14,7 @@ environment with an older MuJoCo, and writes tests/data/fetch_yardstick.csv:
 """
 
 import argparse
-import contextlib
 import csv
-import io
 import warnings
 from pathlib import Path
 from typing import Any
@@ -154,7 +152,7 @@ def between_engines(recorded, paths):
 
 def report(tasks, engines):
     """(the block of docs/fidelity.md, the recorded episodes, the replayed (grip, object) by task and engine)."""
-    from timing import print_table
+    from timing import table
 
     from mjx_dher import envs
 
@@ -172,12 +170,11 @@ def report(tasks, engines):
                 grip, obj = paths[task, engine]
                 rows.append((task, name, engine, *figures(recorded[task], grip[of], obj[of][:, [0, -1]], of)))
             rows += [row for row in originals if row[:2] == (task, name)]
-    with contextlib.redirect_stdout(io.StringIO()) as text:
-        print_table(HEAD, rows)
-        if "slide" in tasks and set(ENGINES) <= set(engines):
-            print("\nSlide, the engines against one another:\n")
-            print("\n".join(between_engines(recorded["slide"], paths)))
-    return text.getvalue().strip(), recorded, paths
+    block = table(HEAD, rows)
+    if "slide" in tasks and set(ENGINES) <= set(engines):
+        lines = between_engines(recorded["slide"], paths)
+        block = "\n".join([block, "", "Slide, the engines against one another:", "", *lines])
+    return block, recorded, paths
 
 
 def draw(recorded, paths):

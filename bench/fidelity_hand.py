@@ -26,9 +26,7 @@ tests/data/hand_TASK.npz has E episodes of T steps, and every tenth state:
 """
 
 import argparse
-import contextlib
 import csv
-import io
 import sys
 from typing import Any
 
@@ -123,7 +121,7 @@ def replay(env, recorded, episodes, steps):
 
 def report(tasks, engines, episodes, steps):
     """The table, as text."""
-    from timing import print_table
+    from timing import table
 
     from mjx_dher import envs
 
@@ -143,9 +141,7 @@ def report(tasks, engines, episodes, steps):
             if len(of):
                 rows += [(task, name, engine, *figures(recorded, path[of], of)) for engine, path in paths.items()]
             rows += [row for row in originals if row[:2] == (task, name)]
-    with contextlib.redirect_stdout(io.StringIO()) as text:
-        print_table(HEAD, rows)
-    return text.getvalue().strip()
+    return table(HEAD, rows)
 
 
 # The originals.

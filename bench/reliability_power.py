@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import power_recorder
-from reliability_pairs import ROOT, SHAPES, ended, faults_of, of_run, of_sweep, same, start
+from reliability_pairs import ROOT, SHAPES, ended, faults_of, of_run, of_sweep, same, start, wait_until
 
 from mjx_dher.runs.folder import results, run_folder
 
@@ -42,9 +42,7 @@ def start_recorded(disk, store, *arguments):
 
 def cut(process, written, rng):
     """Lets a process work until a little after `written` exists, then ends it."""
-    deadline = time.monotonic() + 120
-    while process.poll() is None and not written() and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_until(lambda: process.poll() is not None or written(), seconds=120)
     time.sleep(rng.uniform(0, 6))
     process.send_signal(signal.SIGKILL)
     process.communicate()
