@@ -30,10 +30,7 @@ from mjx_dher.types import Batch, EnvSpec
 STATE, GOAL, ACTION, BATCH = 10, 3, 4, 64
 LOSSES = {"forward": "fwd_infonce", "backward": "bwd_infonce", "symmetric": "sym_infonce"}
 HPARAMS = HParams(action_l2=0.0, entropy_target=-0.5)
-STYLES: dict[str, dict[str, Any]] = {
-    "mlp": {"use_relu": True},
-    "residual": {"use_ln": True, "skip_connections": 2},
-}
+STYLES: dict[str, dict[str, Any]] = {"mlp": {"use_relu": True}, "residual": {"use_ln": True, "skip_connections": 2}}
 
 
 def load(folder: Path, name: str) -> ModuleType:

@@ -106,11 +106,7 @@ class Timed:
         """Seconds per update of one seed: total, gradients, drawing."""
         drawing, updating, whole = (jax.jit(jax.vmap(f)) for f in (self.draw_all, self.updates_only, self.both))
         batches = jax.jit(jax.vmap(self.draw))(self.keys)
-        calls = (
-            lambda: whole(self.states, self.keys),
-            lambda: updating(self.states, batches),
-            lambda: drawing(self.keys),
-        )
+        calls = (lambda: whole(self.states, self.keys), lambda: updating(self.states, batches), lambda: drawing(self.keys))
         both, update, draw = (median_seconds(call) / self.each for call in calls)
         return both, update, draw
 

@@ -106,10 +106,7 @@ BAD = [
     (["--eval-episodes", HUGE], [f"eval_episodes must lie in [1, 1000000]; got {HUGE}"]),
     (["--checkpoint-every", HUGE], [f"checkpoint_every must lie in [0, 1000000]; got {HUGE}"]),
     (["sweep", "--out", "x", "--seeds", HUGE], [f"seeds must lie in [1, 1000000]; got {HUGE}"]),
-    (
-        ["--env", "pusch"],
-        ["env must be one of arm_reach, ", ", or module:attribute; got 'pusch' (did you mean 'push'"],
-    ),
+    (["--env", "pusch"], ["env must be one of arm_reach, ", ", or module:attribute; got 'pusch' (did you mean 'push'"]),
     (["--env", "not_there:Task"], ["env 'not_there:Task': there is no module 'not_there' in the current folder or on"]),
     (["--env", "tasks/mine.py:Task"], ["env must be module:attribute, with the module's name as in `import`; got"]),
     (["--sampler", "not_there:soon"], ["sampler 'not_there:soon': there is no module 'not_there'"]),

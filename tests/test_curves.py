@@ -113,11 +113,7 @@ def test_the_interval_of_success_is_wilson_s(tmp_path):
 def test_runs_are_called_by_what_differs(tmp_path):
     make = lambda name, **changes: curves.read_curve(write_run(tmp_path / name, dataclasses.replace(SPEC, **changes)))  # noqa: E731
     runs = [make("a"), make("b", seed=3), make("c", env_kwargs=("reward_type=dense",))]
-    assert curves.labels(runs) == [
-        "env_kwargs none, seed 0",
-        "env_kwargs none, seed 3",
-        "env_kwargs reward_type=dense, seed 0",
-    ]
+    assert curves.labels(runs) == ["env_kwargs none, seed 0", "env_kwargs none, seed 3", "env_kwargs reward_type=dense, seed 0"]
     same = [make("d"), make("e"), make("f", seed=1)]
     assert curves.labels(same) == [f"seed 0: {tmp_path / 'd'}", f"seed 0: {tmp_path / 'e'}", "seed 1"]
     assert curves.labels(same[:2]) == [str(tmp_path / "d"), str(tmp_path / "e")]

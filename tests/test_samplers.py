@@ -182,10 +182,7 @@ def test_a_normalization_of_one_s_own(mine):
 REFUSED = [  # arguments of `make`, and what the message names: the field, the value and what is allowed
     ({"name": "futur"}, ["sampler", "'futur'", ", ".join(COMPONENTS["sampler"]), "did you mean 'future'"]),
     ({"name": "weighted", "kernel": "softmx"}, ["weight_kernel", "'softmx'", "linear, inverse, softmax", "'softmax'?"]),
-    (
-        {"name": "weighted", "normalization": "meam"},
-        ["weight_normalization", "'meam'", "mean, sum, max, minmax", "'mean'"],
-    ),
+    ({"name": "weighted", "normalization": "meam"}, ["weight_normalization", "'meam'", "mean, sum, max, minmax", "'mean'"]),
     ({"name": "weighted", "normalization": ""}, ["weight_normalization", "''", "mean, sum, max, minmax"]),
     ({"name": "weighted", "normalization": "mine:two"}, ["weight_normalization", "(distance, candidates, scale)", " 2"]),
     ({"name": "future", "normalization": "meam"}, ["weight_normalization", "'meam'"]),

@@ -116,13 +116,7 @@ def test_every_field_of_a_model_is_read_without_effect_or_at_its_default():
     model = welded('<actuator><motor name="m" joint="j"/></actuator>' + FEW)
     checked = [name for name, _ in fields(model) if has_default(name)]
     assert len(checked) > 30
-    assert {
-        "tendon_armature",
-        "geom_surfacevel",
-        "actuator_armature",
-        "pair_adhesion",
-        "opt.disableactuator",
-    } <= {*checked}
+    assert {"tendon_armature", "geom_surfacevel", "actuator_armature", "pair_adhesion", "opt.disableactuator"} <= {*checked}
     for name in checked:
         if name in ("na", "nflex", "nhistory", "nplugin"):
             continue  # cannot be set

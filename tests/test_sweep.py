@@ -318,11 +318,7 @@ def test_what_is_no_sweep_is_named(tmp_path):
     run(tmp_path, trials)
     cell = grid.folder_of(tmp_path, trials[0])
     for name, content, part in (
-        (
-            "metrics.csv",
-            "epoch,success_rate\n",
-            "5 epochs",
-        ),
+        ("metrics.csv", "epoch,success_rate\n", "5 epochs"),
         ("config.json", json.dumps({"schema": 0}), "schema"),
         ("result.json", "{", "line 1 column 2"),
     ):

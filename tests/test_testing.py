@@ -218,10 +218,7 @@ BROKEN = {
     "no length": (broken(__init__=lambda self: None), "episode_length .* at least 1.* None"),
     "no reward function": (broken(compute_reward=None), "has no compute_reward"),
     "reset fails": (broken(reset=lambda self, key: jnp.zeros(2) + jnp.zeros(3)), "reset raises TypeError: "),
-    "no pytree": (
-        broken(reset=lambda self, key: Plain(Quick.reset(self, key))),
-        "reset raises TypeError: .*Plain",
-    ),
+    "no pytree": (broken(reset=lambda self, key: Plain(Quick.reset(self, key))), "reset raises TypeError: .*Plain"),
     "a name in the state": (counting("first", lambda count: count), r"reset raises TypeError: .*\.count"),
     "no reward": (
         broken(_state=lambda self, position, goal: NoReward(PointMass._state(self, position, goal).obs, jnp.zeros(()))),

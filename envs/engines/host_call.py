@@ -51,12 +51,7 @@ class _Metadata(ctypes.Structure):
 class _Extension(ctypes.Structure):
     """Extension of a frame, with `metadata` if `type` is _METADATA."""
 
-    _fields_ = (
-        ("struct_size", ctypes.c_size_t),
-        ("type", _int),
-        ("next", _pointer),
-        ("metadata", ctypes.POINTER(_Metadata)),
-    )
+    _fields_ = (("struct_size", ctypes.c_size_t), ("type", _int), ("next", _pointer), ("metadata", ctypes.POINTER(_Metadata)))
 
 
 class _Buffer(_Struct):

@@ -53,10 +53,7 @@ def of_run(folder: Path, report: Callable[[str], None] = lambda text: None) -> s
     else:
         body.append(_element("p", "No epoch of the run has ended."))
     body += [_element("h2", "Settings"), *_settings(spec, curve.content)]
-    body += [
-        _element("code", f"mjx-dher --config {folder / run_folder.CONFIG_FILE}"),
-        _footer(curve.content.get("versions")),
-    ]
+    body += [_element("code", f"mjx-dher --config {folder / run_folder.CONFIG_FILE}"), _footer(curve.content.get("versions"))]
     return _page(f"{spec.env}: {spec.sampler}, seed {spec.seed}", body)
 
 
