@@ -187,6 +187,7 @@ def test_effects_of_the_tuned_methods():
     with (ROOT / "docs" / "as_published_test_runs.csv").open() as file:
         runs = {(row["task"], row["arm"], row["seed"]): float(row["mean_success"]) for row in csv.DictReader(file)}
     rows = [line for line in (ROOT / "docs" / "what_helps.md").read_text().splitlines() if line.startswith("| `")]
+    [effects] = [line for line in rows if "(`archer`)" in line]
     tuned = {line.split("`")[1]: line.partition("k tuned for both")[2].lower() for line in rows}
     tuned |= {"energy_clipped": tuned["energy"], "dpp": tuned["diversity"]}  # in one row each
     for task, arm, said in (
@@ -206,6 +207,7 @@ def test_effects_of_the_tuned_methods():
     ):
         gains = np.array([runs[task, arm, str(seed)] - runs[task, "future", str(seed)] for seed in range(10, 20)])
         low, high = scipy.stats.t.interval(0.95, 9, gains.mean(), scipy.stats.sem(gains))
+        assert arm != "archer" or f" {gains.mean():+.3f} " in effects
         assert said.format(gain=gains.mean(), loss=-gains.mean(), low=low, high=high) in tuned[arm], (task, arm)
 
 
