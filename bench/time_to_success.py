@@ -19,6 +19,7 @@ from bakeoff_runs import save
 from timing import print_table
 
 from mjx_dher import HParams, envs, learners, presets, priorities, samplers, stats
+from mjx_dher.cli.settings import check_writable
 from mjx_dher.contract import env_spec
 from mjx_dher.evaluate import play_policy
 from mjx_dher.runs.loop import train
@@ -38,8 +39,10 @@ def main() -> None:
     args = parser.parse_args()
     if args.seeds < 1:
         parser.error(f"--seeds is 1 or more; got {args.seeds}")
-    if args.out and not args.out.resolve().parent.is_dir():
-        parser.error(f"--out: there is no folder {args.out.parent}")
+    if args.out:
+        if not args.out.resolve().parent.is_dir():
+            parser.error(f"--out: there is no folder {args.out.parent}")
+        check_writable(args.out.parent)
     spec = presets.preset(args.preset, args.env)
     config, hparams = spec.config, spec.hparams
     for name, _, value in (change.partition("=") for change in args.set):
