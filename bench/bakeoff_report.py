@@ -70,10 +70,12 @@ def _smallest_effect(seeds: int, tests: int) -> float:
     rng = np.random.default_rng(0)
     drawn = rng.normal(size=(2000, seeds))
     every = np.array(list(itertools.product((1, -1), repeat=seeds))) if seeds <= 12 else rng.choice((1, -1), size=(4096, seeds))
+    if seeds <= 12:
+        every = every[: len(every) // 2]  # the other half has the same sums with the other sign
+    flipped, changed = drawn @ every.T, every.sum(axis=1)  # sums without an effect, and what an effect of 1 adds
 
     def power(effect: float) -> float:
-        differences = drawn + effect
-        larger = np.abs(differences @ every.T) >= np.abs(differences.sum(axis=1, keepdims=True)) - 1e-12
+        larger = np.abs(flipped + effect * changed) >= np.abs(drawn.sum(axis=1, keepdims=True) + effect * seeds) - 1e-12
         return float(np.mean(larger.mean(axis=1) <= ALPHA / tests))
 
     low, high = 0.0, 20.0

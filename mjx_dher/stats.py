@@ -157,10 +157,10 @@ def improvement_interval(
     a, b = (scores[:, None] if scores.ndim == 1 else scores for scores in (a, b))  # [A, K], [B, K]
     wins = np.greater(a[:, None], b[None]) + np.equal(a[:, None], b[None]) / 2  # [A, B, K]
     drawn = rng.integers(np.repeat([len(a), len(b)], [a.size, b.size]), size=(repeats, a.size + b.size))
-    of_a, of_b = np.zeros((repeats, *a.shape)), np.zeros((repeats, *b.shape))  # how often a score was drawn
-    repeat, task = np.arange(repeats)[:, None, None], np.arange(a.shape[1])
-    for times, chosen in zip((of_a, of_b), np.split(drawn, [a.size], axis=1)):
-        np.add.at(times, (repeat, chosen.reshape(times.shape), task), 1)
+    column, tasks = np.arange(a.size + b.size), a.shape[1]
+    place = drawn * tasks + column % tasks + a.size * (column >= a.size) + column.size * np.arange(repeats)[:, None]
+    times = np.bincount(place.ravel(), minlength=place.size).reshape(place.shape)  # how often a score was drawn
+    of_a, of_b = (np.reshape(part, (repeats, -1, tasks)) for part in np.split(times, [a.size], axis=1))
     resampled = np.einsum("rbk,rbk->r", np.einsum("rak,abk->rbk", of_a, wins), of_b) / wins.size
     low, high = _quantiles(resampled, level)
     return float(low), float(high)
@@ -233,7 +233,7 @@ def westfall_young(differences: ArrayLike, repeats: int = 100_000, seed: int = 0
     if 2**seeds <= repeats:
         signs = 1 - 2 * (np.arange(2**seeds)[:, None] >> np.arange(seeds) & 1)
     else:
-        signs = _generator(seed, repeats).choice([-1, 1], size=(repeats, seeds))
+        signs = _generator(seed, repeats).choice(np.array([-1, 1], np.int8), size=(repeats, seeds))
         signs[0] = 1  # the data itself
     # A monotone function of |t|: a flip does not change the sum of squares.
     scale = np.sqrt(number * np.square(values).sum(axis=1))

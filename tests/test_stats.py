@@ -118,6 +118,20 @@ def test_probability_of_improvement():
         stats.probability_of_improvement(mine, other[:, :2])
 
 
+@pytest.mark.parametrize("tasks", [1, 3])
+def test_the_interval_of_improvement_is_that_of_resampled_scores(tasks):
+    """Each task's scores are drawn on their own, those of `a` first, as a plain loop draws them."""
+    rng = np.random.default_rng(1)
+    a, b = SCORES[:4, :tasks].round(1), rng.beta(3, 2, (7, tasks)).round(1)
+    drawn = np.random.default_rng(0).integers(np.repeat([4, 7], [4 * tasks, 7 * tasks]), size=(50, 11 * tasks))
+    found = []
+    for line in drawn:
+        of_a, of_b = line[: 4 * tasks].reshape(4, tasks), line[4 * tasks :].reshape(7, tasks)
+        found.append(stats.probability_of_improvement(a[of_a, range(tasks)], b[of_b, range(tasks)]))
+    want = np.quantile(found, [0.025, 0.975], method="inverted_cdf")
+    np.testing.assert_allclose(stats.improvement_interval(a, b, repeats=50), want, atol=1e-12)
+
+
 def test_paired_p_value_by_hand():
     assert stats.paired_p_value([1, 2, 3], [0, 1, 2]) == pytest.approx(2 / 8)
     assert stats.paired_p_value([1, 2], [1, 2]) == 1
