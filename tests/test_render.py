@@ -75,7 +75,7 @@ def drawn(tmp_path_factory):
     """Folder of SCRIPT, and what its commands printed."""
     folder = tmp_path_factory.mktemp("render")
     run_folder.write_config(
-        folder / "run", RunSpec(env="push", env_kwargs=("episode_length=12",), engine="native"), "native", {}
+        folder / "run", RunSpec(env="push", env_kwargs=("episode_length=4",), engine="native"), "native", {}
     )
     still = policy.Policy(
         layers=((np.zeros((28, 4)), np.zeros(4)),),
@@ -139,7 +139,7 @@ def test_a_tendon_is_drawn_between_its_sites(frames):
 
 def test_the_command_writes_every_frame(drawn):
     folder, printed = drawn
-    assert frames_in(folder / "run.gif", 96, 64) == 2 * (13 + 10)
+    assert frames_in(folder / "run.gif", 96, 64) == 2 * (5 + 10)
     assert "push: 2 episodes, seed 1, physics native, drawn with " in printed
     assert f"of 2; wrote {folder / 'run.gif'}\n" in printed
 
