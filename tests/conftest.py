@@ -16,6 +16,10 @@ import types
 import zlib
 from pathlib import Path
 
+# Threads of NumPy's matrix products wait in a loop for the next one, on a core that another worker needs. NumPy reads this on
+# import.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import numpy as np
 import pytest
 
