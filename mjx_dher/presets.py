@@ -178,8 +178,9 @@ def _cpu_slide(env: str) -> Settings:
     return _kept(base, 1_280_000, critic_lr=3e-3, noise_std=0.1, random_eps=0.2, her_k=4.0)
 
 
-def _gpu_pick_and_place(env: str) -> Settings:
-    return _small(_entropy(env), num_envs=256, updates_per_cycle=500, policy_delay=2, critic_lr=3e-3)
+def _pick_and_place(env: str) -> Settings:
+    base = _small(_entropy(env), num_envs=256, updates_per_cycle=500, policy_delay=2, critic_lr=3e-3)
+    return _kept(base, 704_000, her_k=8.0, hindsight_reward=0.5)
 
 
 class _Best(NamedTuple):
@@ -192,6 +193,7 @@ class _Best(NamedTuple):
 
 
 _DDPG = _Best("ddpg", "mlp", None)
+_PICK_AND_PLACE = _Best("tqc", "layer_norm", _pick_and_place, {"priority": "energy"})
 _CRL = _Best("crl", "mlp", None, {"sampler": "geometric"})  # for each task and preset
 _LEARNERS = {  # by preset, and environment or robot
     ("cpu", "hand"): _Best("dtqc", "layer_norm", _cpu_hand, {"priority": "td_error"}),
@@ -202,12 +204,10 @@ _LEARNERS = {  # by preset, and environment or robot
         "ddpg", "mlp", lambda env: _kept(_gpu_hand_reach(env), 480_000, num_envs=64, cycles_per_epoch=5, updates_per_cycle=80)
     ),
     ("cpu", "push"): _Best("td3", "mlp", _cpu_push),
-    ("cpu", "pick_and_place"): _Best(
-        "tqc", "layer_norm", lambda env: _kept(_gpu_pick_and_place(env), 1_024_000), {"priority": "energy"}
-    ),
+    ("cpu", "pick_and_place"): _PICK_AND_PLACE,
     ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error"}),
     ("gpu", "hand_reach"): _Best("ddpg", "mlp", _gpu_hand_reach),
-    ("gpu", "pick_and_place"): _Best("tqc", "layer_norm", _gpu_pick_and_place, {"priority": "energy"}),
+    ("gpu", "pick_and_place"): _PICK_AND_PLACE,
     ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide, {"priority": "td_error"}),
     ("frugal", "push"): _Best("td3", "mlp", lambda env: _with(_frugal(env), noise_std=0.6)),
     ("frugal", "pick_and_place"): _Best("tqc", "layer_norm", lambda env: _kept(_entropy(env), 500_000, num_envs=64)),
