@@ -69,10 +69,11 @@ def smallest_effect(spread: float, seeds: int, tests: int) -> float:
 def _smallest_effect(seeds: int, tests: int) -> float:
     rng = np.random.default_rng(0)
     drawn = rng.normal(size=(2000, seeds))
-    every = np.array(list(itertools.product((1, -1), repeat=seeds))) if seeds <= 12 else rng.choice((1, -1), size=(4096, seeds))
-    if seeds <= 12:
-        every = every[: len(every) // 2]  # the other half has the same sums with the other sign
-    flipped, changed = drawn @ every.T, every.sum(axis=1)  # sums without an effect, and what an effect of 1 adds
+    if seeds <= 12:  # the first difference keeps its sign: flipping all of them changes only the sign of their sum
+        every = np.array(list(itertools.product((1,), *(seeds - 1) * [(1, -1)])))
+    else:
+        every = rng.choice((1, -1), size=(4096, seeds))
+    flipped, changed = drawn @ every.T, every.sum(axis=1)  # sums without an effect, and the change by an effect of 1
 
     def power(effect: float) -> float:
         larger = np.abs(flipped + effect * changed) >= np.abs(drawn.sum(axis=1, keepdims=True) + effect * seeds) - 1e-12

@@ -239,40 +239,39 @@ def messages(folder, args):
     return done, "nothing ended or blocked; a browser still served", faults
 
 
-def parts_apart(args):
-    """Parts with their own runs: functions of a folder. Each returns a count of its trials, their outcome, and the faults."""
-    return {
-        "pairs": lambda folder: reliability_pairs.pairs(folder, args.pairs, random.Random(args.seed), args.workers),
-        "power": lambda folder: reliability_power.power(folder, args.power, random.Random(args.seed), args.workers),
-        "edits": reliability_calls.edits,
-        "calls": reliability_calls.calls,
-        "messages": lambda folder: messages(folder, args),
-        "signals": lambda folder: reliability_signals.signals(folder, args.signals, args.seed, args.workers),
-        "splices": reliability_splices.splices,
-        "disks": reliability_machines.disks,
-        "containers": reliability_machines.containers,
-        "hostile": reliability_hostile.hostile,
-    }
+# Parts that do not share `Runs`: functions of a folder and the arguments. Each returns a count of its trials, their outcome,
+# and the faults.
+APART: dict[str, Any] = {
+    "pairs": lambda folder, args: reliability_pairs.pairs(folder, args.pairs, random.Random(args.seed), args.workers),
+    "power": lambda folder, args: reliability_power.power(folder, args.power, random.Random(args.seed), args.workers),
+    "edits": lambda folder, args: reliability_calls.edits(folder),
+    "calls": lambda folder, args: reliability_calls.calls(folder),
+    "messages": messages,
+    "signals": lambda folder, args: reliability_signals.signals(folder, args.signals, args.seed, args.workers),
+    "splices": lambda folder, args: reliability_splices.splices(folder),
+    "disks": lambda folder, args: reliability_machines.disks(folder),
+    "containers": lambda folder, args: reliability_machines.containers(folder),
+    "hostile": lambda folder, args: reliability_hostile.hostile(folder),
+}
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = {"kills": kills, "flips": flips, "damage": damage, "disk": disk, "twice": twice}
-    names = [*parts, *parts_apart(parser)]  # whose functions are not called
+    names = [*parts, *APART]
     parser.add_argument("--parts", nargs="+", choices=names, default=names)
     numbers = {"kills": 200, "flips": 200, "pairs": 100, "power": 50, "messages": 200, "signals": 50, "workers": 1, "seed": 0}
     for name, number in numbers.items():
         parser.add_argument(f"--{name}", type=int, default=number)
     parser.add_argument("--env", default="reach")
     args = parser.parse_args()
-    apart = parts_apart(args)
     rows, failed = [], False
     with tempfile.TemporaryDirectory() as folder:
-        runs = Runs(args.env, folder) if set(args.parts) - set(apart) else None
+        runs = Runs(args.env, folder) if set(args.parts) - set(APART) else None
         for name in args.parts:
             try:
-                if name in apart:
-                    *texts, faults = apart[name](Path(folder, name))
+                if name in APART:
+                    *texts, faults = APART[name](Path(folder, name), args)
                     expect_none(faults)
                 else:
                     texts = parts[name](runs, getattr(args, name, 0), random.Random(args.seed))

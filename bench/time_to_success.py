@@ -23,10 +23,12 @@ from mjx_dher.cli.settings import check_writable
 from mjx_dher.contract import env_spec
 from mjx_dher.evaluate import play_policy
 from mjx_dher.runs.loop import train
+from mjx_dher.system.files import FolderError
 from mjx_dher.system.machine import keep_compiled_programs
 
 
-def main() -> None:
+def parse() -> argparse.Namespace:
+    """Checked arguments. Unusable ones end the program with status 2 and an error message."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--env", default="push")
     parser.add_argument("--engine", default="auto")
@@ -42,7 +44,15 @@ def main() -> None:
     if args.out:
         if not args.out.resolve().parent.is_dir():
             parser.error(f"--out: there is no folder {args.out.parent}")
-        check_writable(args.out.parent)
+        try:
+            check_writable(args.out.parent)
+        except FolderError as error:
+            parser.error(str(error))
+    return args
+
+
+def main() -> None:
+    args = parse()
     spec = presets.preset(args.preset, args.env)
     config, hparams = spec.config, spec.hparams
     for name, _, value in (change.partition("=") for change in args.set):

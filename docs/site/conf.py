@@ -152,7 +152,7 @@ def classes(module: str) -> dict[str, ast.ClassDef]:
 
 @functools.cache
 def texts_of(module: str, owner: str) -> dict[str, str]:
-    """Docstrings of a class's fields, or else the comments next to and above them, by name. Empty if there is no such class."""
+    """Docstrings of a class's fields, or else the comments next to and above them. Empty if there is no such class."""
     if (node := classes(module).get(owner)) is None:
         return {}
     rows, texts = Path(sys.modules[module].__file__ or "").read_text(encoding="utf-8").splitlines(), {}
