@@ -199,11 +199,15 @@ def test_effects_of_the_tuned_methods():
         ("pick_and_place", "archer", "gains {gain:.3f} on pickandplace ({low:.3f} to {high:.3f})"),
         ("slide", "archer", "{gain:.3f} on slide ({low:.3f} to {high:.3f})"),
         ("push", "td_error", "gains {gain:.3f} on push ({low:.3f} to {high:.3f})"),
-        ("slide", "td_error", "on slide {gain:.3f} is not shown"),
+        ("slide", "td_error", "and {gain:.3f} on slide"),
         ("push", "dpp", "loses {loss:.3f} on push"),
+        ("pick_and_place", "dpp", "{loss:.3f} on pickandplace"),
         ("slide", "dpp", "and {loss:.3f} on slide"),
         ("push", "curriculum", "loses {loss:.3f} on push"),
+        ("pick_and_place", "curriculum", "{loss:.3f} on pickandplace"),
         ("slide", "curriculum", "and {loss:.3f} on slide"),
+        ("pick_and_place", "not_misleading", "{gain:.3f} on pickandplace is not shown"),
+        ("pick_and_place", "td_error", "not shown are {gain:.3f} on pickandplace"),
     ):
         gains = np.array([runs[task, arm, str(seed)] - runs[task, "future", str(seed)] for seed in range(10, 20)])
         low, high = scipy.stats.t.interval(0.95, 9, gains.mean(), scipy.stats.sem(gains))
