@@ -175,7 +175,8 @@ def _gpu_slide(env: str) -> Settings:
 
 def _cpu_slide(env: str) -> Settings:
     base = _small(_cpu(env), num_envs=256, updates_per_cycle=500, policy_delay=2, n_step=3, renewals=5, cycles_per_epoch=2)
-    return _kept(base, 1_280_000, critic_lr=3e-3, noise_std=0.1, random_eps=0.2, her_k=4.0)
+    base = _with(base, critic_lr=3e-3, polyak=0.99, noise_std=0.1, random_eps=0.2)
+    return _kept(base, 1_280_000, her_k=8.0, hindsight_reward=0.5, priority_fraction=0.8)
 
 
 def _pick_and_place(env: str) -> Settings:

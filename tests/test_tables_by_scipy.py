@@ -215,6 +215,26 @@ def test_effects_of_the_tuned_methods():
         assert said.format(gain=gains.mean(), loss=-gains.mean(), low=low, high=high) in tuned[arm], (task, arm)
 
 
+def test_the_candidate_of_slide_passed():
+    """Means, spreads and Student's intervals of the third stage, as preset_screen.md has them."""
+    with (ROOT / "docs" / "preset_screen_slide_runs.csv").open() as file:
+        rows = [(row["setting"], int(row["seed"]), float(row["late_success"]), float(row["final"])) for row in csv.DictReader(file)]
+    assert [row[:2] for row in rows] == [(name, seed) for name in ("preset", "candidate") for seed in range(670, 690)]
+    late, final = (np.array([row[column] for row in rows]).reshape(2, 20) for column in (2, 3))
+    page = (ROOT / "docs" / "experiments" / "preset_screen.md").read_text()
+    for a, b in zip(late, final):
+        assert f"| {a.mean():.3f} | {b.mean():.3f} ({b.min():.3f} to {b.max():.3f}) | {b.std(ddof=1):.3f} |" in page
+    gains = []
+    for preset, candidate in (late, final):
+        each = candidate - preset
+        low, high = scipy.stats.t.interval(0.95, 19, each.mean(), scipy.stats.sem(each))
+        gains.append(f"{each.mean():+.3f} ({low:.3f} to {high:.3f})")
+    assert f"| {gains[0]} | {gains[1]} |" in page
+    assert f"in {(late[1] > late[0]).sum()} of 20 pairs" in page
+    falls = [f"{np.median(each) - each.min():.3f}" for each in final[::-1]]
+    assert "{} below the median, the\nformer preset's {}.".format(*falls) in page
+
+
 def test_what_hindsight_gains():
     """Of the table of runs with and without hindsight: means, and Student's interval of the paired difference."""
     section = (ROOT / "docs" / "experiments" / "preset_gpu.md").read_text().split("## Without hindsight")[1].split("\n## ")[0]
