@@ -218,7 +218,9 @@ def test_effects_of_the_tuned_methods():
 def test_the_candidate_of_slide_passed():
     """Means, spreads and Student's intervals of the third stage, as preset_screen.md has them."""
     with (ROOT / "docs" / "preset_screen_slide_runs.csv").open() as file:
-        rows = [(row["setting"], int(row["seed"]), float(row["late_success"]), float(row["final"])) for row in csv.DictReader(file)]
+        rows = [
+            (row["setting"], int(row["seed"]), float(row["late_success"]), float(row["final"])) for row in csv.DictReader(file)
+        ]
     assert [row[:2] for row in rows] == [(name, seed) for name in ("preset", "candidate") for seed in range(670, 690)]
     late, final = (np.array([row[column] for row in rows]).reshape(2, 20) for column in (2, 3))
     page = (ROOT / "docs" / "experiments" / "preset_screen.md").read_text()
