@@ -10,10 +10,8 @@ It is bench/bakeoff.py with other arms, and has its options. Each arm is a separ
 the plan.
 """
 
-import dataclasses
 import sys
 from collections.abc import Callable
-from typing import Any
 
 import bakeoff
 from bakeoff_arms import SIZES, TOY, Arm, Experiment, tuned
@@ -23,16 +21,6 @@ from mjx_dher.spec import RunSpec
 PLAIN = {"tqc": "sac", "dtqc": "td3"}  # a mean in place of quantiles
 
 
-def sized(run: RunSpec, **sizes: Any) -> RunSpec:
-    """The run with other fields of its Config."""
-    return dataclasses.replace(run, config=dataclasses.replace(run.config, **sizes))
-
-
-def numbered(run: RunSpec, **numbers: float) -> RunSpec:
-    """The run with other fields of its HParams."""
-    return dataclasses.replace(run, hparams=run.hparams._replace(**numbers))
-
-
 def other_entropy(run: RunSpec) -> RunSpec:
     """The run with `dtqc`, which has no entropy, in place of `tqc`, or the reverse.
 
@@ -40,23 +28,23 @@ def other_entropy(run: RunSpec) -> RunSpec:
     smoothed.
     """
     if run.learner == "tqc":
-        return numbered(dataclasses.replace(run, learner="dtqc"), action_l2=1.0, target_noise=0.0)
-    return numbered(dataclasses.replace(run, learner="tqc"), action_l2=0.0, entropy_weight=0.1)
+        return run.replace(learner="dtqc", action_l2=1.0, target_noise=0.0)
+    return run.replace(learner="tqc", action_l2=0.0, entropy_weight=0.1)
 
 
 # What an arm changes about the preset's run.
 CHANGES: dict[str, Callable[[RunSpec], RunSpec]] = {
     "preset": lambda run: run,
-    "no_quantiles": lambda run: dataclasses.replace(run, learner=PLAIN[run.learner]),
+    "no_quantiles": lambda run: run.replace(learner=PLAIN[run.learner]),
     "other_entropy": other_entropy,
-    "one_critic": lambda run: sized(run, num_critics=1),
-    "no_layer_norm": lambda run: dataclasses.replace(run, networks="mlp"),
-    "one_step": lambda run: sized(run, n_step=1),
-    "half_width": lambda run: sized(run, hidden_sizes=tuple(size // 2 for size in run.config.hidden_sizes)),
-    "half_batch": lambda run: sized(run, batch_size=run.config.batch_size // 2),
-    "half_updates": lambda run: sized(run, updates_per_cycle=run.config.updates_per_cycle // 2),
-    "no_eventful": lambda run: numbered(run, priority_fraction=0.0),
-    "ddpg": lambda run: numbered(sized(dataclasses.replace(run, learner="ddpg", networks="mlp"), n_step=1), action_l2=1.0),
+    "one_critic": lambda run: run.replace(num_critics=1),
+    "no_layer_norm": lambda run: run.replace(networks="mlp"),
+    "one_step": lambda run: run.replace(n_step=1),
+    "half_width": lambda run: run.replace(hidden_sizes=tuple(size // 2 for size in run.config.hidden_sizes)),
+    "half_batch": lambda run: run.replace(batch_size=run.config.batch_size // 2),
+    "half_updates": lambda run: run.replace(updates_per_cycle=run.config.updates_per_cycle // 2),
+    "no_eventful": lambda run: run.replace(priority_fraction=0.0),
+    "ddpg": lambda run: run.replace(learner="ddpg", networks="mlp", n_step=1, action_l2=1.0),
 }
 ARMS = tuple(Arm(name, name) for name in CHANGES)  # each a program of its own
 
@@ -68,9 +56,9 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     Slide's has the priority `td_error`; PickAndPlace's has smaller networks, returns of one step and `energy`.
     """
     del learner
-    run = dataclasses.replace(tuned("slide" if toy else task, priority="eventful"), env=task)
+    run = tuned("slide" if toy else task, priority="eventful").replace(env=task)
     sizes = {**TOY, "target_period": 10} if toy else SIZES["best", task]
-    return CHANGES[arm.name](sized(run, n_step=3, **sizes))
+    return CHANGES[arm.name](run.replace(n_step=3, **sizes))
 
 
 ABLATION = Experiment(ARMS, ("gpu",), ("pick_and_place", "slide"), spec_of, "ablation.csv")

@@ -46,8 +46,7 @@ def _workers(
     steps = 2 * number * 50 * cycles * epochs
     sizes = {"num_envs": 2 * number, "batch_size": number * batch, "cycles_per_epoch": cycles}
     numbers = {"random_noise": 0.0, "adam_eps": 1e-8 / number, "priority_fraction": float(arm.prioritized)}  # all of a batch
-    config = dataclasses.replace(run.config, **(TOY if toy else {**sizes, "total_steps": steps, "replay_size": steps}))
-    return dataclasses.replace(run, config=config, hparams=run.hparams._replace(**numbers))
+    return run.replace(**(TOY if toy else {**sizes, "total_steps": steps, "replay_size": steps}), **numbers)
 
 
 # FetchReach as in the README of CHER's code, with one worker. Success is 1 after 4,000 steps.
@@ -59,13 +58,12 @@ ebp = functools.partial(_workers, 19, 256, 50, 50)
 def next_future(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Run of the bake-off's `paper` at a tolerance: `5cm` or `2cm`."""
     run = bakeoff_arms.spec_of("paper", task, arm, toy)
-    return dataclasses.replace(run, env_kwargs=("distance_threshold=0.02",)) if learner == "2cm" else run
+    return run.replace(env_kwargs=("distance_threshold=0.02",)) if learner == "2cm" else run
 
 
 def with_k(task: str, arm: Arm, k: int, toy: bool) -> RunSpec:
     """Run of the bake-off's `paper` with another k."""
-    run = bakeoff_arms.spec_of("paper", task, arm, toy)
-    return dataclasses.replace(run, hparams=run.hparams._replace(her_k=float(k)))
+    return bakeoff_arms.spec_of("paper", task, arm, toy).replace(her_k=float(k))
 
 
 def tune(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:

@@ -198,9 +198,10 @@ def parts_of(task: str, arm: Arm) -> dict[str, str]:
     return parts
 
 
-_AS_OF_2026_11_25: dict[str, dict[str, Any]] = {
+_AS_OF: dict[str, dict[str, Any]] = {  # 2026-11-25, the hand 2026-11-27
     "pick_and_place": {"num_envs": 512, "replay_size": 4_000_000},
     "slide": {"policy_delay": 1, "renewals": 0, "learner_dtype": "float32"},
+    "block_rotate_z": {"her_k": 4.0},
 }
 
 
@@ -211,8 +212,7 @@ def tuned(task: str, **parts: str) -> RunSpec:
     larger ring. On Block Z, k is 4, as until 2026-11-27.
     """
     run = presets.preset("frugal" if task == "pick_and_place" else "gpu", task, **parts)
-    hparams = run.hparams._replace(her_k=4.0) if task == "block_rotate_z" else run.hparams
-    return dataclasses.replace(run, config=dataclasses.replace(run.config, **_AS_OF_2026_11_25.get(task, {})), hparams=hparams)
+    return run.replace(**_AS_OF.get(task, {}))
 
 
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
@@ -230,7 +230,7 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     numbers = dict(arm.numbers)
     if arm.prioritized and learner == "paper":
         numbers["priority_fraction"] = 1.0
-    return dataclasses.replace(run, config=dataclasses.replace(run.config, **changes), hparams=run.hparams._replace(**numbers))
+    return run.replace(**changes, **numbers)
 
 
 BAKEOFF = Experiment(ARMS, LEARNERS, TASKS, spec_of, "bakeoff.csv")

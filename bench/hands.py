@@ -7,11 +7,9 @@
 It is bench/bakeoff.py with other arms, and has its options. docs/experiments/preset_hands.md has the plan.
 """
 
-import dataclasses
 import sys
 
 import bakeoff
-from ablation import numbered, sized
 from bakeoff_arms import SIZES, TOY, Arm, Experiment
 
 from mjx_dher import presets
@@ -31,10 +29,9 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Run of an arm, seed 0. Without its own, an arm has the sampler `future`, k 4 and no priority."""
     del learner
     parts = {"sampler": "future", "priority": "eventful", **arm.parts}
-    run = dataclasses.replace(presets.preset("gpu", "hand_reach" if toy else task, **parts), env=task)
     sizes = TOY if toy else SIZES["best", task]
-    run = sized(run, **{"replay_size": sizes["total_steps"], **sizes})
-    return numbered(run, **{"her_k": 4.0, "priority_fraction": 0.0, **arm.numbers})
+    changes = {"replay_size": sizes["total_steps"], **sizes, "her_k": 4.0, "priority_fraction": 0.0, **arm.numbers}
+    return presets.preset("gpu", "hand_reach" if toy else task, **parts).replace(env=task, **changes)
 
 
 HANDS = Experiment(ARMS, ("gpu",), ("hand_reach", "block_rotate_z"), spec_of, "hands.csv")

@@ -8,12 +8,10 @@
 It is bench/bakeoff.py with other arms, and has its options. docs/experiments/ablation.md has the plan.
 """
 
-import dataclasses
 import sys
 from collections.abc import Callable
 
 import bakeoff
-from ablation import sized
 from bakeoff_arms import SIZES, TOY, Arm, Experiment, tuned
 
 from mjx_dher.spec import RunSpec
@@ -22,20 +20,20 @@ RESET_CYCLES = 6  # of 17 on Slide and 15 on Block Z, so that the last reset has
 # What an arm changes about the preset: `dtqc`, `layer_norm` in the critics, three layers of 512.
 CHANGES: dict[str, Callable[[RunSpec], RunSpec]] = {
     "preset": lambda run: run,
-    "mlp": lambda run: dataclasses.replace(run, networks="mlp"),
-    "residual": lambda run: dataclasses.replace(run, networks="residual"),
-    "unit_norm": lambda run: dataclasses.replace(run, networks="unit_norm"),
-    "categorical": lambda run: dataclasses.replace(run, learner="ctd3"),
-    "categorical_unit_norm": lambda run: dataclasses.replace(run, learner="ctd3", networks="unit_norm"),
-    "resets": lambda run: sized(run, reset_every=RESET_CYCLES * run.config.updates_per_cycle),
+    "mlp": lambda run: run.replace(networks="mlp"),
+    "residual": lambda run: run.replace(networks="residual"),
+    "unit_norm": lambda run: run.replace(networks="unit_norm"),
+    "categorical": lambda run: run.replace(learner="ctd3"),
+    "categorical_unit_norm": lambda run: run.replace(learner="ctd3", networks="unit_norm"),
+    "resets": lambda run: run.replace(reset_every=RESET_CYCLES * run.config.updates_per_cycle),
 }
 
 
 def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Run of an arm, seed 0, with the priority `td_error`, which both presets had."""
     del learner
-    run = dataclasses.replace(tuned("slide" if toy else task, priority="td_error"), env=task)
-    return CHANGES[arm.name](sized(run, **(TOY if toy else SIZES["best", task])))
+    run = tuned("slide" if toy else task, priority="td_error").replace(env=task)
+    return CHANGES[arm.name](run.replace(**(TOY if toy else SIZES["best", task])))
 
 
 ARMS = tuple(Arm(name, name) for name in CHANGES)

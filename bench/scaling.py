@@ -125,9 +125,8 @@ def resized(name, args, times=1):
     changes = {name: value for name, value in changes.items() if value is not None}
     if args.hidden_sizes:
         changes["hidden_sizes"] = tuple(args.hidden_sizes)
-    config = dataclasses.replace(spec.config, **changes)
-    larger = {name: times * getattr(config, name) for name in ("num_envs", "batch_size", "replay_size")}
-    return dataclasses.replace(spec, config=dataclasses.replace(config, **larger))
+    spec = spec.replace(**changes)
+    return spec.replace(**{name: times * getattr(spec.config, name) for name in ("num_envs", "batch_size", "replay_size")})
 
 
 def lanes(args):

@@ -7,7 +7,6 @@
 It is bench/bakeoff.py with other arms, and has its options. docs/experiments/td_controls.md is the plan.
 """
 
-import dataclasses
 import sys
 
 import bakeoff
@@ -45,8 +44,8 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     if arm.name == MORE:
         updates, period = run.config.updates_per_cycle, run.config.target_period
         more = period * round(SLOWER * updates / period)  # the targets' period divides it
-        run = dataclasses.replace(run, config=dataclasses.replace(run.config, updates_per_cycle=more))
-    return dataclasses.replace(run, hparams=run.hparams._replace(**arm.numbers))
+        run = run.replace(updates_per_cycle=more)
+    return run.replace(**arm.numbers)
 
 
 CONTROLS = Experiment(ARMS, ("best", "paper"), TASKS, spec_of, "td_controls.csv")

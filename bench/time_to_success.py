@@ -8,7 +8,6 @@ or above the threshold. The final success is over 500 fresh episodes.
 """
 
 import argparse
-import dataclasses
 import statistics
 import time
 from pathlib import Path
@@ -18,7 +17,7 @@ import jax
 from bakeoff_runs import save
 from timing import print_table
 
-from mjx_dher import HParams, envs, learners, presets, priorities, samplers, stats
+from mjx_dher import envs, learners, presets, priorities, samplers, stats
 from mjx_dher.cli.settings import check_writable
 from mjx_dher.contract import env_spec
 from mjx_dher.evaluate import play_policy
@@ -54,13 +53,9 @@ def parse() -> argparse.Namespace:
 def main() -> None:
     args = parse()
     spec = presets.preset(args.preset, args.env)
+    known = {**vars(spec.config), **spec.hparams._asdict()}
+    spec = spec.replace(**{name: type(known[name])(value) for name, _, value in (change.partition("=") for change in args.set)})
     config, hparams = spec.config, spec.hparams
-    for name, _, value in (change.partition("=") for change in args.set):
-        if name in HParams._fields:
-            hparams = hparams._replace(**{name: float(value)})
-        else:
-            changed: Any = {name: type(getattr(config, name))(value)}
-            config = dataclasses.replace(config, **changed)
     env = envs.make(args.env, engine=args.engine)
     learner = learners.make(spec.learner, config, env_spec(env), spec.networks)
     parts: dict[str, Any] = {"sampler": samplers.make(args.sampler), "priority": priorities.make(spec.priority)}

@@ -7,7 +7,6 @@ It is bench/bakeoff.py with a preset in place of a learner and one arm, and has 
 one row per seed. docs/experiments/presets.md has the table.
 """
 
-import dataclasses
 import sys
 
 import bakeoff
@@ -25,7 +24,7 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     """Run of a preset, seed 0, with README's sampler on the Fetch tasks."""
     del arm
     run = presets.preset(learner, task, **({} if robot(task) == "hand" else {"sampler": "weighted"}))
-    return dataclasses.replace(run, config=dataclasses.replace(run.config, **TOY, n_step=1)) if toy else run
+    return run.replace(**TOY, n_step=1) if toy else run
 
 
 UNSEEN = Experiment((Arm("preset", "plain"),), ("cpu", "gpu", "frugal"), TASKS, spec_of, "unseen.csv")

@@ -60,6 +60,17 @@ class RunSpec:
         with contextlib.suppress(ValueError, TypeError):  # `validate` reports the problem
             object.__setattr__(self, "env_kwargs", to_texts(to_arguments(self.env_kwargs)))
 
+    def replace(self, **settings: Any) -> "RunSpec":
+        """Copy with other settings, by the names of fields of RunSpec, Config or HParams. Raises ValueError for other names."""
+        numbers = {name: settings.pop(name) for name in HParams._fields if name in settings}
+        sizes = {field.name: settings.pop(field.name) for field in dataclasses.fields(Config) if field.name in settings}
+        fields = [field.name for field in dataclasses.fields(self)]
+        for name in settings:
+            check_name("a setting", name, (*fields, *vars(self.config), *HParams._fields))
+        config, hparams = settings.pop("config", self.config), settings.pop("hparams", self.hparams)
+        config, hparams = dataclasses.replace(config, **sizes), hparams._replace(**numbers)
+        return dataclasses.replace(self, config=config, hparams=hparams, **settings)
+
     @property
     def env_arguments(self) -> dict[str, Argument]:
         """Keyword arguments for `envs.make`."""

@@ -76,6 +76,16 @@ def test_the_frugal_preset_plays_less_and_learns_more_from_it(env):
     assert learned[0] > max(learned[1:])
 
 
+def test_a_run_with_other_settings_by_name():
+    run = presets.preset("cpu", "slide")
+    changed = run.replace(num_envs=4, gamma=0.9, sampler="weighted", seed=3)
+    assert (changed.config.num_envs, changed.hparams.gamma, changed.sampler, changed.seed) == (4, 0.9, "weighted", 3)
+    assert changed.replace(num_envs=256, gamma=0.97, sampler="future", seed=0) == run != changed
+    assert run.replace(config=Config(), num_envs=4) == dataclasses.replace(run, config=Config(num_envs=4))
+    with pytest.raises(ValueError, match="'num_env' \\(did you mean 'num_envs'"):
+        run.replace(num_env=4)
+
+
 def test_sizes_that_follow():
     c = Config(num_envs=16, cycles_per_epoch=50, total_steps=100_001, replay_size=1_000_049)
     assert config.steps_per_epoch(c, 50) == 40_000

@@ -81,7 +81,7 @@ def _to_resume(args: ResumeArgs, stop_at: float | None, content: dict[str, Any],
         )
     reading.check_written(args.run, content, run)
     if args.total_steps is not None:
-        run = dataclasses.replace(run, config=dataclasses.replace(run.config, total_steps=args.total_steps))
+        run = run.replace(total_steps=args.total_steps)
     spec.validate(run)
     options.check()
     if results.has_result(args.run) and (result := results.read_result(args.run))["status"] != run_folder.FAILED:

@@ -175,12 +175,9 @@ def trials_of(args: SweepArgs, preset: str) -> list[RunSpec]:
         learns = {field: part for field, part in named.items() if field in ("learner", "networks")}
         # A run's unread settings do not depend on the rest of the grid, so that a larger one has the same run.
         make = functools.partial(presets.preset, preset, env, engine=args.engine, env_kwargs=args.env_kwargs)
-        base, unread = (
-            dataclasses.replace(run, config=dataclasses.replace(run.config, **changes))
-            for run in (make(**named), make(**learns))
-        )
+        base, unread = make(**named).replace(**changes), make(**learns).replace(**changes)
         for point in itertools.product(*axes.values()):
-            run = dataclasses.replace(base, hparams=base.hparams._replace(**dict(zip(axes, point))))
+            run = base.replace(**dict(zip(axes, point)))
             spec.validate(run)
             specs.append(run)
             plain.append(unread)

@@ -50,13 +50,8 @@ def settings(spec: RunSpec) -> dict[str, Any]:
 
 def with_unread_of(base: RunSpec, spec: RunSpec) -> RunSpec:
     """Copy of `spec` in which settings that its sampler and learner do not read come from `base`."""
-    values = settings(spec)
-    unread = [name for name in values if not reads(values, name)]
-    numbers = {name: getattr(base.hparams, name) for name in unread if name in HParams._fields}
-    sizes = {name: getattr(base.config, name) for name in unread if hasattr(base.config, name)}
-    parts = {name: getattr(base, name) for name in unread if name not in (*numbers, *sizes)}
-    config, hparams = dataclasses.replace(spec.config, **sizes), spec.hparams._replace(**numbers)
-    return dataclasses.replace(spec, config=config, hparams=hparams, **parts)
+    values, others = settings(spec), settings(base)
+    return spec.replace(**{name: others[name] for name in values if not reads(values, name)})
 
 
 def groups(spec: RunSpec) -> dict[str, dict[str, Any]]:
