@@ -1,6 +1,5 @@
 """Presets: tuned settings, and the paper's. Loads neither JAX nor MuJoCo, except in `machine_preset`."""
 
-import dataclasses
 import importlib.util
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, NamedTuple, get_args
@@ -13,7 +12,7 @@ from mjx_dher.spec import RunSpec
 Preset = Literal["cpu", "gpu", "frugal", "paper"]
 PRESETS = get_args(Preset)
 
-_TUNED = HParams(gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, priority_fraction=0.5)
+_TUNED = RunSpec().replace(target_period=1, gamma=0.95, polyak=0.98, noise_std=0.4, her_k=16.0, priority_fraction=0.5)
 
 
 def machine_preset() -> str:
@@ -36,10 +35,10 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
     Args:
       learner: learner. Default: the preset's, which may bring its own numbers and priority. Others use the numbers of `ddpg`.
       networks: networks. Default: the preset's for this learner.
-      **changes: other fields of the run, such as `sampler` or `seed`.
+      **changes: other settings (`RunSpec.replace`), such as `sampler`, `seed` or `num_envs`.
 
     Raises:
-      ValueError: there is no such preset.
+      ValueError: there is no such preset or setting.
     """
     check_name("preset", name, PRESETS)
     best = _LEARNERS.get((name, env)) or _LEARNERS.get((name, robot(env)), _DDPG)
@@ -47,41 +46,29 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
         best = _CRL
     elif learner not in (None, best.learner):
         best = _DDPG._replace(learner=str(learner))
-    config, hparams = (best.setup or {"cpu": _cpu, "gpu": _gpu, "frugal": _frugal, "paper": _paper}[name])(env)
+    run = (best.setup or {"cpu": _cpu, "gpu": _gpu, "frugal": _frugal, "paper": _paper}[name])(env)
     if best is _CRL:
-        hparams = hparams._replace(action_l2=0.0, random_eps=0.1)
+        run = run.replace(action_l2=0.0, random_eps=0.1)
     networks = networks or ("fan_in" if name == "paper" else best.networks)
-    return RunSpec(
-        env=env, config=config, hparams=hparams, learner=best.learner, networks=networks, **{**best.parts, **changes}
-    )
+    return run.replace(**{"env": env, "learner": best.learner, "networks": networks, **best.parts, **changes})
 
 
-Settings = tuple[Config, HParams]
+def _kept(base: RunSpec, steps: int, **changes: Any) -> RunSpec:
+    """The base with `steps` environment steps, a ring that keeps them all, and other `changes`."""
+    return base.replace(total_steps=steps, replay_size=steps, **changes)
 
 
-def _with(settings: Settings, **changes: Any) -> Settings:
-    """The settings with other sizes and numbers."""
-    config, hparams = settings
-    numbers = {name: changes.pop(name) for name in HParams._fields if name in changes}
-    return dataclasses.replace(config, **changes), hparams._replace(**numbers)
+def _small(base: RunSpec, **changes: Any) -> RunSpec:
+    """The base with one critic, two layers, no target noise, and other `changes`."""
+    return base.replace(num_critics=1, hidden_sizes=(256, 256), target_noise=0.0, **changes)
 
 
-def _kept(settings: Settings, steps: int, **changes: Any) -> Settings:
-    """The settings with `steps` environment steps, a ring that keeps them all, and other `changes`."""
-    return _with(settings, total_steps=steps, replay_size=steps, **changes)
-
-
-def _small(settings: Settings, **changes: Any) -> Settings:
-    """The settings with one critic, two layers, no target noise, and other `changes`."""
-    return _with(settings, num_critics=1, hidden_sizes=(256, 256), target_noise=0.0, **changes)
-
-
-def _cpu(env: str) -> Settings:
-    base = Config(num_envs=32, cycles_per_epoch=15, target_period=1, batch_size=1024, total_steps=600_000), _TUNED
+def _cpu(env: str) -> RunSpec:
+    base = _TUNED.replace(num_envs=32, cycles_per_epoch=15, batch_size=1024, total_steps=600_000)
     if env == "reach":
-        return _with(base, num_envs=16, cycles_per_epoch=10, batch_size=256, total_steps=16_000)
+        return base.replace(num_envs=16, cycles_per_epoch=10, batch_size=256, total_steps=16_000)
     if env == "pick_and_place":
-        return _with(base, total_steps=1_000_000, noise_std=0.2, lr_end=0.05)
+        return base.replace(total_steps=1_000_000, noise_std=0.2, lr_end=0.05)
     if env == "slide":
         return _kept(base, 1_500_000, gamma=0.97, noise_std=0.2, lr_end=0.05)
     if robot(env) == "hand":
@@ -89,23 +76,23 @@ def _cpu(env: str) -> Settings:
     return base
 
 
-def _cpu_push(env: str) -> Settings:
+def _cpu_push(env: str) -> RunSpec:
     return _small(_cpu(env), updates_per_cycle=128, batch_size=512, policy_delay=2, total_steps=360_000, critic_lr=2e-3)
 
 
-def _gpu(env: str) -> Settings:
-    config = Config(num_envs=2048, cycles_per_epoch=3, updates_per_cycle=1000, target_period=1, batch_size=1024)
-    base = _with((config, _TUNED), total_steps=1_500_000, replay_size=2_000_000)
+def _gpu(env: str) -> RunSpec:
+    base = _TUNED.replace(num_envs=2048, cycles_per_epoch=3, updates_per_cycle=1000, batch_size=1024)
+    base = base.replace(total_steps=1_500_000, replay_size=2_000_000)
     if env == "reach":
-        return _with(base, num_envs=256, cycles_per_epoch=1, updates_per_cycle=200, total_steps=64_000)
+        return base.replace(num_envs=256, cycles_per_epoch=1, updates_per_cycle=200, total_steps=64_000)
     if env not in ("pick_and_place", "slide"):
         return base
-    base = _with(base, cycles_per_epoch=5, updates_per_cycle=500, replay_size=4_000_000, lr_end=0.05)
-    base = _with(base, noise_std=0.1, random_eps=0.2, total_steps=6_000_000)
-    return base if env == "pick_and_place" else _with(base, total_steps=10_000_000, gamma=0.97, her_k=8.0)
+    base = base.replace(cycles_per_epoch=5, updates_per_cycle=500, replay_size=4_000_000, lr_end=0.05)
+    base = base.replace(noise_std=0.1, random_eps=0.2, total_steps=6_000_000)
+    return base if env == "pick_and_place" else base.replace(total_steps=10_000_000, gamma=0.97, her_k=8.0)
 
 
-def _paper(env: str) -> Settings:
+def _paper(env: str) -> RunSpec:
     workers = 16 if env == "pick_and_place" else 8
     epochs = 200 if env == "slide" else 50
     total_steps = epochs * 50 * 2 * workers * 50
@@ -120,66 +107,66 @@ def _paper(env: str) -> Settings:
         replay_size=min(1_000_000 * workers, total_steps),
     )
     # The workers sum their gradients. For Adam, averaging them and dividing its epsilon by their number is the same.
-    return config, HParams(random_noise=1.0, adam_eps=1e-8 / workers)
+    return RunSpec(config=config, hparams=HParams(random_noise=1.0, adam_eps=1e-8 / workers))
 
 
-def _frugal(env: str) -> Settings:
+def _frugal(env: str) -> RunSpec:
     base = _cpu(env)
     if env == "reach":
-        return _with(base, updates_per_cycle=80, total_steps=8_000)
-    steps = {"push": 160_000, "pick_and_place": 500_000, "slide": 1_000_000}.get(env, base[0].total_steps)
-    return _with(base, cycles_per_epoch=5, updates_per_cycle=200, total_steps=steps)
+        return base.replace(updates_per_cycle=80, total_steps=8_000)
+    steps = {"push": 160_000, "pick_and_place": 500_000, "slide": 1_000_000}.get(env, base.config.total_steps)
+    return base.replace(cycles_per_epoch=5, updates_per_cycle=200, total_steps=steps)
 
 
-def _entropy(env: str, **changes: Any) -> Settings:
+def _entropy(env: str, **changes: Any) -> RunSpec:
     """Base settings of the PickAndPlace presets with `tqc`, and `changes`."""
-    base = _with(_gpu(env), num_envs=512, updates_per_cycle=1000, total_steps=1_000_000, action_l2=0.0, entropy_weight=0.1)
-    return _with(base, **changes)
+    base = _gpu(env).replace(num_envs=512, updates_per_cycle=1000, total_steps=1_000_000, action_l2=0.0, entropy_weight=0.1)
+    return base.replace(**changes)
 
 
-def _gpu_hand(env: str) -> Settings:
+def _gpu_hand(env: str) -> RunSpec:
     steps = {"block_rotate_z": 2_000_000, "block": 8_000_000, "egg": 8_000_000, "pen": 8_000_000}.get(env, 4_000_000)
     k = 1.0 if env == "block_rotate_z" else 4.0
-    base = _with(_gpu(env), num_envs=1024, cycles_per_epoch=2, updates_per_cycle=3500, total_steps=steps, her_k=k)
-    return _with(base, replay_size=4_000_000, hidden_sizes=(512, 512, 512), learner_dtype="bfloat16", gamma=0.98, lr_end=0.05)
+    base = _gpu(env).replace(num_envs=1024, cycles_per_epoch=2, updates_per_cycle=3500, total_steps=steps, her_k=k)
+    return base.replace(replay_size=4_000_000, hidden_sizes=(512, 512, 512), learner_dtype="bfloat16", gamma=0.98, lr_end=0.05)
 
 
-def _cpu_hand(env: str) -> Settings:
+def _cpu_hand(env: str) -> RunSpec:
     base = _small(_gpu_hand(env), num_envs=64, cycles_per_epoch=16, updates_per_cycle=250, policy_delay=2, critic_lr=2e-3)
     return _kept(base, 1_024_000, her_k=4.0, renewals=5)
 
 
-def _gpu_arm(env: str) -> Settings:
-    config = Config(num_envs=256, cycles_per_epoch=4, updates_per_cycle=1000, target_period=1, batch_size=512)
-    numbers = HParams(polyak=0.98, action_l2=0.0, entropy_weight=0.1, random_eps=0.1, lr_end=0.05)
+def _gpu_arm(env: str) -> RunSpec:
+    base = RunSpec().replace(num_envs=256, cycles_per_epoch=4, updates_per_cycle=1000, target_period=1, batch_size=512)
+    base = base.replace(polyak=0.98, action_l2=0.0, entropy_weight=0.1, random_eps=0.1, lr_end=0.05)
     steps = {"arm_reach": 512_000, "arm_push_hard": 6_144_000}
-    return _kept((config, numbers), steps.get(env, 3_072_000), hidden_sizes=(256, 256))
+    return _kept(base, steps.get(env, 3_072_000), hidden_sizes=(256, 256))
 
 
-def _cpu_arm(env: str) -> Settings:
+def _cpu_arm(env: str) -> RunSpec:
     base = _gpu_arm(env)
-    return _kept(base, base[0].total_steps // 2, num_envs=64, cycles_per_epoch=8, updates_per_cycle=250)
+    return _kept(base, base.config.total_steps // 2, num_envs=64, cycles_per_epoch=8, updates_per_cycle=250)
 
 
-def _gpu_hand_reach(env: str) -> Settings:
+def _gpu_hand_reach(env: str) -> RunSpec:
     # Little noise, because it moves all fingertips at once, and a goal allows 1 cm.
-    base = _with(_gpu(env), num_envs=128, cycles_per_epoch=8, updates_per_cycle=400, batch_size=512)
-    base = _with(base, total_steps=1_000_000, replay_size=1_024_000, polyak=0.99, lr_end=0.05)
-    return _with(base, noise_std=0.1, random_eps=0.1, her_k=4.0, priority_fraction=0.0)
+    base = _gpu(env).replace(num_envs=128, cycles_per_epoch=8, updates_per_cycle=400, batch_size=512)
+    base = base.replace(total_steps=1_000_000, replay_size=1_024_000, polyak=0.99, lr_end=0.05)
+    return base.replace(noise_std=0.1, random_eps=0.1, her_k=4.0, priority_fraction=0.0)
 
 
-def _gpu_slide(env: str) -> Settings:
-    base = _with(_gpu(env), updates_per_cycle=1000, total_steps=8_000_000, n_step=3, renewals=5)
-    return _with(base, hidden_sizes=(512, 512, 512), target_noise=0.0, policy_delay=2, learner_dtype="bfloat16")
+def _gpu_slide(env: str) -> RunSpec:
+    base = _gpu(env).replace(updates_per_cycle=1000, total_steps=8_000_000, n_step=3, renewals=5)
+    return base.replace(hidden_sizes=(512, 512, 512), target_noise=0.0, policy_delay=2, learner_dtype="bfloat16")
 
 
-def _cpu_slide(env: str) -> Settings:
+def _cpu_slide(env: str) -> RunSpec:
     base = _small(_cpu(env), num_envs=256, updates_per_cycle=500, policy_delay=2, n_step=3, renewals=5, cycles_per_epoch=2)
-    base = _with(base, critic_lr=3e-3, polyak=0.99, noise_std=0.1, random_eps=0.2)
+    base = base.replace(critic_lr=3e-3, polyak=0.99, noise_std=0.1, random_eps=0.2)
     return _kept(base, 1_280_000, her_k=8.0, hindsight_reward=0.5, priority_fraction=0.8)
 
 
-def _pick_and_place(env: str) -> Settings:
+def _pick_and_place(env: str) -> RunSpec:
     base = _small(_entropy(env), num_envs=256, updates_per_cycle=500, policy_delay=2, critic_lr=3e-3)
     return _kept(base, 704_000, her_k=8.0, hindsight_reward=0.5)
 
@@ -189,7 +176,7 @@ class _Best(NamedTuple):
 
     learner: str
     networks: str
-    setup: Callable[[str], Settings] | None
+    setup: Callable[[str], RunSpec] | None
     parts: Mapping[str, str] = {}  # fields of the run that differ from RunSpec's defaults
 
 
@@ -210,7 +197,7 @@ _LEARNERS = {  # by preset, and environment or robot
     ("gpu", "hand_reach"): _Best("ddpg", "mlp", _gpu_hand_reach),
     ("gpu", "pick_and_place"): _PICK_AND_PLACE,
     ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide, {"priority": "td_error"}),
-    ("frugal", "push"): _Best("td3", "mlp", lambda env: _with(_frugal(env), noise_std=0.6)),
+    ("frugal", "push"): _Best("td3", "mlp", lambda env: _frugal(env).replace(noise_std=0.6)),
     ("frugal", "pick_and_place"): _Best("tqc", "layer_norm", lambda env: _kept(_entropy(env), 500_000, num_envs=64)),
     ("frugal", "slide"): _Best(
         "dtqc", "layer_norm", lambda env: _small(_frugal(env), updates_per_cycle=150, n_step=3), {"priority": "td_error"}

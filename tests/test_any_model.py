@@ -149,7 +149,7 @@ def test_what_mjx_ignores_is_rejected_with_the_element():
         make_engine("jax", model, SUBSTEPS)
 
 
-@pytest.mark.parametrize("is_chain", [True, False])
+@pytest.mark.parametrize("is_chain", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_mjx_has_inertia_of_tendons_along_one_chain_only(is_chain):
     body = '<body pos="0 0 {}"><joint name="{}" axis="0 1 0"/><geom size=".05" mass="1" pos=".1 0 0" contype="0"/>'
     first, second = body.format(1, "a"), body.format(0.2, "b")

@@ -28,15 +28,14 @@ def folders(**given):
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("name", FOLDERS)
-def test_a_folder_that_the_user_has_chosen_is_kept(name, tmp_path):
-    assert folders(HOME=tmp_path, **{name: tmp_path / "mine"})[name] == str(tmp_path / "mine")
+def test_folders_that_the_user_has_chosen_are_kept(tmp_path):
+    mine = {name: str(tmp_path / name) for name in FOLDERS}
+    assert folders(HOME=tmp_path, **mine) == mine
 
 
 def test_otherwise_they_are_kept_from_run_to_run_apart_from_those_of_the_user_s_own_runs(tmp_path):
     first = folders(HOME=tmp_path)
     assert first == {name: str(tmp_path / ".cache" / "mjx-dher-tests" / kind) for name, kind in zip(FOLDERS, ("xla", "warp"))}
-    assert folders(HOME=tmp_path) == first
     elsewhere = folders(XDG_CACHE_HOME=tmp_path / "other")
     assert elsewhere["WARP_CACHE_PATH"] == str(tmp_path / "other" / "mjx-dher-tests" / "warp")
 

@@ -9,8 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import sweep_helpers
 from configs import SHORT, flags
 from conftest import EXAMPLES, refuses
+from sweep_helpers import compile_once  # noqa: F401
 
 import mjx_dher
 from mjx_dher import HParams, Options, RunSpec, cli
@@ -43,6 +45,7 @@ def result_of(folder):
 def test_train_and_a_sweep_of_the_same_run_give_the_same_to_the_bit(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(EXAMPLES))
     assert cli.main([*FLAGS, "--seed", "3", "--out", str(tmp_path / "run")]) == 0
+    monkeypatch.setattr(sweep_helpers, "_compiled", {})  # compiled again
     sweep = ["--first-seed", "3", "--seeds", "1", "--lanes", "1", "--out", str(tmp_path / "sweep")]
     assert cli.main(["sweep", *FLAGS, *sweep]) == 0
     trial = next((tmp_path / "sweep" / "cells").glob("*/result.json")).parent
@@ -91,6 +94,7 @@ def trained(tmp_path_factory):
     specs, seen, said = THREE, [], []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ddpg.DDPG, "update", breaking())
+        patch.setattr(sweep_helpers, "_compiled", {})
         results = mjx_dher.train_runs(
             PointMass(),
             specs,
@@ -145,6 +149,7 @@ def test_a_lane_that_diverges_ends_alone_and_says_so_everywhere(trained, capsys)
 def test_a_lane_that_had_failed_when_the_others_were_stopped_costs_them_nothing(trained, tmp_path, monkeypatch):
     """They go on from their checkpoint, and all end as those that were not stopped."""
     monkeypatch.setattr(ddpg.DDPG, "update", breaking())
+    monkeypatch.setattr(sweep_helpers, "_compiled", {})
     folders, seen = [tmp_path / "cells" / fingerprint.trial_name(spec) for spec in THREE], []
     arguments = {"options": Options(final_episodes=20, log=("jsonl",)), "lanes": 3, "sweep": True}
     arguments |= {"on_epoch": lambda specs, progress: seen.append(progress.epoch), "should_stop": lambda: seen == [1, 2]}

@@ -144,7 +144,7 @@ print("end")
 """
 
 
-@pytest.mark.parametrize("drop", ["", "del out"])
+@pytest.mark.parametrize("drop", ["", pytest.param("del out", marks=pytest.mark.slow)])
 def test_python_ends_in_order_while_a_program_simulates(drop):
     ran = subprocess.run(
         [sys.executable, "-c", ENDS.format("out", drop)], capture_output=True, text=True, timeout=120, check=False

@@ -9,6 +9,7 @@ import shutil
 import numpy as np
 import pytest
 from configs import SHORT as CONFIG
+from conftest import names
 from sweep_helpers import LONGER, compile_once, cut_short, make_grid, run, spec_of, table  # noqa: F401
 from test_driver import rows_of
 
@@ -116,6 +117,7 @@ EDITS = {
     ("config", "learner_dtype"): "bfloat16",
     **{("hparams", name): 0.123 for name in HParams._fields},
 }
+ONE_OF_EACH_TYPE = ("env", "env_kwargs", "demonstrations", "seed", "num_envs", "hidden_sizes", "learner_dtype", "gamma")
 EDITS = {path: value for path, value in EDITS.items() if path != ("config", "cycles_per_epoch")} | {
     ("config", "cycles_per_epoch"): 3,
     ("config", "target_period"): 2,
@@ -125,7 +127,10 @@ EDITS = {path: value for path, value in EDITS.items() if path != ("config", "cyc
 def test_a_setting_that_was_edited_is_named_and_refused(stopped, whole, capsys):
     shutil.copy(whole / "config.json", whole / "kept")
     for path, value in [
-        (path, x) for path, right in EDITS.items() for x in (right, 3 if isinstance(right, str) else "x", [], None)
+        (path, x)
+        for path, right in EDITS.items()
+        for x in (right, 3 if isinstance(right, str) else "x", [], None)
+        if x is right or path[-1] in ONE_OF_EACH_TYPE
     ]:
         name = path[-1]
         for folder in (whole, stopped):
@@ -200,15 +205,15 @@ def test_fewer_steps_than_were_made_are_refused_and_nothing_is_lost(stopped, cap
     assert resume(stopped, capsys)[0] == 0
 
 
-@pytest.mark.parametrize("flags", [["--log", "jsonl"], ["--keep", "1"], ["--final-episodes", "7"], ["--checkpoint-every", "0"]])
-def test_options_may_change(stopped, whole, capsys, flags):
+def test_options_may_change(stopped, whole, capsys):
+    flags = ["--log", "jsonl", "--keep", "1", "--final-episodes", "7", "--checkpoint-every", "0"]
     status, text = resume(stopped, capsys, *flags)
-    assert (status, f"{flags[0][2:].replace('-', '_')} {flags[1]}" in text or flags[0] == "--log") == (0, True), text
+    assert status == 0, text
+    names(text, "keep 1", "final_episodes 7", "checkpoint_every 0")
     assert rows_of(stopped) == rows_of(whole)
-    if flags[0] == "--log":
-        lines = [json.loads(line) for line in (stopped / "metrics.jsonl").read_text().splitlines()]
-        assert [line["epoch"] for line in lines] == [1, 2, 3, 4, 5, 6]
-        assert [f"{line['critic_loss']:.6g}" for line in lines] == [row["critic_loss"] for row in rows_of(whole)]
+    lines = [json.loads(line) for line in (stopped / "metrics.jsonl").read_text().splitlines()]
+    assert [line["epoch"] for line in lines] == [1, 2, 3, 4, 5, 6]
+    assert [f"{line['critic_loss']:.6g}" for line in lines] == [row["critic_loss"] for row in rows_of(whole)]
 
 
 @pytest.mark.parametrize(("name", "value"), [("checkpoint_every", "x"), ("log", None), ("log", "jsonl"), ("keep", [1])])
@@ -218,13 +223,12 @@ def test_an_option_of_another_type_is_refused(stopped, capsys, name, value):
     assert (status, name in text, "Traceback" in text) == (2, True, False), text
 
 
-@pytest.mark.parametrize("lines", [3, 4])
-def test_metrics_that_lag_behind_a_checkpoint_make_resume_take_the_one_before(stopped, whole, capsys, lines):
+def test_metrics_that_lag_behind_a_checkpoint_make_resume_take_the_one_before(stopped, whole, capsys):
     """As a power cut leaves them, the last line cut."""
     content = (stopped / "metrics.csv").read_text().splitlines(keepends=True)
-    (stopped / "metrics.csv").write_text("".join(content[:lines]) + content[lines][:-5])
+    (stopped / "metrics.csv").write_text("".join(content[:3]) + content[3][:-5])
     status, text = resume(stopped, capsys)
-    assert f"epoch-000004 has a later epoch than the last complete line of metrics.csv, {lines - 1}" in text
+    assert "epoch-000004 has a later epoch than the last complete line of metrics.csv, 2" in text
     assert (status, "epoch-000002, after epoch 2" in text) == (0, True)
     assert rows_of(stopped) == rows_of(whole)
 

@@ -96,7 +96,7 @@ def test_priorities_choose_the_same_transitions_with_64_bits(priority):
     assert_the_same_both_ways(draw)
 
 
-@pytest.mark.parametrize(("learner", "generator"), [("ddpg", "hgg"), ("tqc", None)])
+@pytest.mark.parametrize(("learner", "generator"), [("ddpg", "hgg"), pytest.param("tqc", None, marks=pytest.mark.slow)])
 def test_a_run_is_nearly_the_same_with_64_bits(learner, generator):
     def train():
         train = trainer.make_train(PointMass(), TINY, learner=learner, generator=generator and generators.make(generator))

@@ -42,45 +42,40 @@ def played(engine, model, qvel, calls, **options):
     return np.concatenate([physics.qpos, physics.qvel])
 
 
-@pytest.mark.parametrize(
-    ("damping", "actuator"),
-    [(' damping="50"', ""), ("", '<actuator><velocity tendon="t" kv="50"/></actuator>')],
-)
-def test_a_tendon_damps_across_branches_as_in_mujoco_c(damping, actuator):
-    model = mujoco.MjModel.from_xml_string(BRANCHES.format(damping=damping, actuator=actuator))
+def test_a_tendon_damps_across_branches_as_in_mujoco_c():
+    """By its own damping, and by a velocity actuator on it."""
+    actuator = '<actuator><velocity tendon="t" kv="30"/></actuator>'
+    model = mujoco.MjModel.from_xml_string(BRANCHES.format(damping=' damping="50"', actuator=actuator))
     start = [1.0, 0.5, 0.0]
     np.testing.assert_allclose(played("jax", model, start, 1), played("native", model, start, 1), atol=1e-5)
 
 
 SLIDES = """<body pos="0.3 0.2 0.1"><joint name="a" type="slide" axis="1 0 0"/><joint name="b" type="slide" axis="0 1 0"/>{}
 <geom size="0.1" mass="1" contype="0"/><site name="s" pos="0.05 0.3 0.1"/></body>"""
-COUPLED = """
+COUPLED = {  # bodies, and the entries of the mass matrix that their joints share
+    SLIDES.format(""): 2,  # diagonal
+    SLIDES.format('<body pos="0 0 1"><joint axis="0 1 0"/><geom size="0.1" mass="1" contype="0"/></body>'): 9,
+    re.sub("<joint.*/>", "<freejoint/>", SLIDES).format(""): 36,
+    re.sub("<joint.*/>", '<joint type="ball"/>', SLIDES).format(""): 3,
+    re.sub("<joint.*/>", '<joint type="ball"/>', SLIDES).format("").replace("<geom", '<geom pos="0.1 0.05 0"'): 9,
+}
+SPINS = re.sub("<joint.*/>", "<freejoint/>", SLIDES).format("").replace('size="0.1"', 'type="box" size="0.1 0.2 0.3"')
+
+
+def test_a_damped_tendon_couples_the_joints_of_one_body_as_in_mujoco_c():
+    """Each of several bodies has its own tendon. The last one spins."""
+    bodies = [re.sub(r'name="(\w)"', rf'name="\g<1>{number}"', body) for number, body in enumerate((*COUPLED, SPINS))]
+    tendon = '<spatial damping="50"><site site="w"/><site site="s{}"/></spatial>'
+    model = mujoco.MjModel.from_xml_string(f"""
 <mujoco><option timestep="0.01" integrator="implicitfast" gravity="0 0 0"/><worldbody>
-<site name="w" pos="0.3 0.1 1"/>{body}</worldbody>
-<tendon><spatial damping="50"><site site="w"/><site site="s"/></spatial></tendon></mujoco>"""
-
-
-@pytest.mark.parametrize(
-    ("body", "common"),
-    [
-        (SLIDES.format(""), 2),  # diagonal
-        (SLIDES.format('<body pos="0 0 1"><joint axis="0 1 0"/><geom size="0.1" mass="1" contype="0"/></body>'), 9),
-        (re.sub("<joint.*/>", "<freejoint/>", SLIDES).format(""), 36),
-        (re.sub("<joint.*/>", '<joint type="ball"/>', SLIDES).format(""), 3),
-        (re.sub("<joint.*/>", '<joint type="ball"/>', SLIDES).format("").replace("<geom", '<geom pos="0.1 0.05 0"'), 9),
-    ],
-)
-def test_a_damped_tendon_couples_the_joints_of_one_body_as_in_mujoco_c(body, common):
-    model = mujoco.MjModel.from_xml_string(COUPLED.format(body=body))
-    assert corrections.in_common(model).sum() == common
-    start = np.resize([1.0, 0.5, -0.3], model.nv) * (np.arange(model.nv) < 3)
-    np.testing.assert_allclose(played("jax", model, start, 1), played("native", model, start, 1), atol=1e-5)
-
-
-def test_a_damped_tendon_slows_a_body_that_spins_freely_as_in_mujoco_c():
-    body = re.sub("<joint.*/>", "<freejoint/>", SLIDES).format("").replace('size="0.1"', 'type="box" size="0.1 0.2 0.3"')
-    model = mujoco.MjModel.from_xml_string(COUPLED.format(body=body))
-    start = [1.0, 0.5, 0.3, 3.0, 1.4, 0.2]
+<site name="w" pos="0.3 0.1 1"/>{"".join(bodies)}</worldbody>
+<tendon>{"".join(map(tendon.format, range(len(bodies))))}</tendon></mujoco>""")
+    places = [np.flatnonzero(model.body_rootid[model.dof_bodyid] == root) for root in np.unique(model.body_rootid[1:])]
+    common = corrections.in_common(model)
+    assert [common[np.ix_(own, own)].sum() for own in places] == [*COUPLED.values(), 36]
+    assert common.sum() == sum(COUPLED.values()) + 36
+    start = np.concatenate([np.resize([1.0, 0.5, -0.3], len(own)) * (np.arange(len(own)) < 3) for own in places[:-1]])
+    start = np.concatenate([start, [1.0, 0.5, 0.3, 3.0, 1.4, 0.2]])
     np.testing.assert_allclose(played("jax", model, start, 1), played("native", model, start, 1), atol=1e-5)
 
 
@@ -166,14 +161,14 @@ def test_an_arms_observed_force_follows_its_varied_gain():
 
 
 @pytest.mark.parametrize("arguments", [{}, {"frame_stack": 2}, {"action_filter": 0.5}, {"action_delay": 1}])
-@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
-def test_an_action_that_is_not_finite_fails(arguments, value):
+def test_an_action_that_is_not_finite_fails(arguments):
     env = envs.make("reach", engine="native", **arguments)
-    state = jax.jit(env.step)(env.reset(jax.random.key(0)), jnp.zeros(4).at[1].set(value))
-    if "action_delay" in arguments:
-        state = jax.jit(env.step)(state, jnp.zeros(4))
-    assert bool(getattr(state, "inner", state).failed)
-    assert not bool(getattr(fine := jax.jit(env.step)(env.reset(jax.random.key(0)), jnp.full(4, 9.0)), "inner", fine).failed)
+    step, first = jax.jit(env.step), jax.jit(env.reset)(jax.random.key(0))
+    for value, fails in ((np.inf, True), (-np.inf, True), (np.nan, True), (9.0, False)):
+        state = step(first, jnp.zeros(4).at[1].set(value))
+        if "action_delay" in arguments:
+            state = step(state, jnp.zeros(4))
+        assert bool(getattr(state, "inner", state).failed) == fails
 
 
 @pytest.mark.parametrize(("child", "refused"), [("", True), ('<body pos="0 0 1">{}</body>', False)])

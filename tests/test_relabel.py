@@ -91,7 +91,7 @@ def test_relabelled_share(ring, k):
 
 
 def test_reward_is_compute_reward_of_the_goal_and_what_the_step_achieved(ring):
-    count = 1_000_000
+    count = 100_000
 
     @jax.jit
     def draw(key):

@@ -16,6 +16,7 @@ from mjx_dher.contrib import priorities as contributed
 from mjx_dher.priorities import Priority
 from mjx_dher.runs.program import Lane
 from point_mass import PointMass
+from probes import Least
 
 ENV = PointMass()
 CONTEXT = Context(ENV.compute_reward, HParams())
@@ -80,7 +81,7 @@ def test_one_of_several_priorities_is_renewed_in_rows_as_it_is_alone():
 
 def test_a_lane_logs_the_mean_priority_of_new_episodes_beside_one_that_renews():
     def logged(priority, hparams):
-        train = make_train(ENV, SMALL, priority=priority)
+        train = make_train(ENV, SMALL, priority=priority, learner=Least())
         return jax.jit(train.epoch)(jax.jit(train.init)(jax.random.key(0), hparams))[1]["priority_mean"]
 
     lane = Lane(*HParams(), choice=0, priority_choice=0, generator_choice=0)
@@ -93,7 +94,7 @@ def renewed_at(renewals, priority):
     number, cycles = SMALL.num_envs, 4
     steps = cycles * number * ENV.episode_length
     config = dataclasses.replace(SMALL, renewals=renewals, cycles_per_epoch=cycles, total_steps=steps, replay_size=2 * steps)
-    train = make_train(ENV, config, priority=priority)
+    train = make_train(ENV, config, priority=priority, learner=Least())
     state, _ = jax.jit(train.epoch)(train.init(jax.random.key(0), HParams()))
     return np.round((np.asarray(state.replay.priority[: cycles * number]).reshape(cycles, number) - 1.0) * cycles)
 
@@ -124,7 +125,7 @@ def test_a_run_renews_its_own_episodes_and_as_many_others_as_it_is_told(renewals
 
 def test_added_demonstrations_are_renewed_too():
     """Cycles that renew their own episodes alone would leave them at 0, and never draw them."""
-    train = make_train(ENV, dataclasses.replace(SMALL, renewals=1), priority=BY_CYCLE)
+    train = make_train(ENV, dataclasses.replace(SMALL, renewals=1), priority=BY_CYCLE, learner=Least())
     state = train.init(jax.random.key(0), HParams())
     state = jax.jit(train.add)(state, jax.tree.map(lambda x: x[:3], random_episodes()))
     np.testing.assert_array_equal(state.replay.priority, [1.0] * 3 + [0.0] * (len(state.replay.priority) - 3))

@@ -285,8 +285,7 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> None:
     """Trains trials until a signal requests a stop."""
     prepare()
     try_components(todo, console)
-    screen = Screen(console, todo)
-    try:
+    with contextlib.closing(Screen(console, todo)) as screen:
         grid.train(
             args.out,
             todo,
@@ -298,8 +297,6 @@ def _train(args: SweepArgs, todo: list[RunSpec], console: Console) -> None:
             report=lambda text: console.print(text, soft_wrap=True),
             on_epoch=screen.show,
         )
-    finally:
-        screen.close()
 
 
 def _write_tables(args: SweepArgs, console: Console) -> None:

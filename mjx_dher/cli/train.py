@@ -224,7 +224,7 @@ def train_into(
         after_epoch()
 
     common.warn_of_tau(run.hparams.polyak, console)
-    try:
+    with contextlib.closing(screen):
         (result,) = driver.train_runs(
             env,
             [run],
@@ -235,8 +235,6 @@ def train_into(
             report=console.print,
             on_epoch=on_epoch,
         )
-    finally:
-        screen.close()
     if result.status == driver.STOPPED:
         console.print(
             f"stopped after epoch {result.epoch} of {result.num_epochs}; the policy so far is in {folder}, and"

@@ -115,8 +115,7 @@ def _name_and_digest(path: Path, files: Sequence[Path]) -> str:
     content = hashlib.sha256()
     for file in files:
         with file.open("rb") as opened:
-            while part := opened.read(1 << 20):  # a mesh or data set may be larger than the memory
-                content.update(part)
+            hashlib.file_digest(opened, lambda: content)  # in parts, as a data set may be larger than the memory
     return f"{path.name} {content.hexdigest()[:10]}"
 
 
@@ -130,13 +129,18 @@ def jax_flags() -> dict[str, Any]:
     return {name: value for name, value in flags.items() if value != JAX_FLAGS[name]}
 
 
+def _not_default(spec: RunSpec) -> dict[str, Any]:
+    defaults = settings(RunSpec())
+    kept = {name: value for name, value in settings(spec).items() if name in ALWAYS or value != defaults[name]}
+    kept.pop("demonstrations", None)  # the file's digest is among the sources
+    return kept
+
+
 def identity(
     spec: RunSpec, physics: str, own_sources: Mapping[str, str], flags: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """Everything that determines a run's result, as JSON: settings, seed, physics, custom source files and JAX flags."""
-    defaults = settings(RunSpec())
-    kept = {name: x for name, x in settings(spec).items() if name in ALWAYS or x != defaults[name]}
-    kept.pop("demonstrations", None)  # the file's digest is among the sources
+    kept = _not_default(spec)
     numbers = {name: float(kept[name]) for name in HParams._fields if name in kept}
     kept |= {"env_kwargs": list(kept["env_kwargs"])} if "env_kwargs" in kept else {}
     content = {**kept, **numbers, "hidden_sizes": list(spec.config.hidden_sizes), "seed": spec.seed, "physics": physics}
@@ -150,9 +154,7 @@ def digest(content: Mapping[str, Any]) -> str:
 
 def trial_name(spec: RunSpec) -> str:
     """Name of a trial's folder: readable settings, and a digest of all settings, custom code and JAX flags."""
-    values, defaults = settings(spec), settings(RunSpec())
-    kept = {name: value for name, value in values.items() if name in ALWAYS or value != defaults[name]} | REMOVED
-    kept.pop("demonstrations", None)
+    kept = _not_default(spec) | REMOVED
     numbers = {name: float(kept.pop(name)) for name in HParams._fields if name in kept}
     numbers["eventful_share"] = numbers.pop("priority_fraction")  # its name in the first digests
     beside = [own for own in (sources(spec), jax_flags()) if own]
