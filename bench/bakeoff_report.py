@@ -73,17 +73,14 @@ def _smallest_effect(seeds: int, tests: int) -> float:
         every = np.array(list(itertools.product((1,), *(seeds - 1) * [(1, -1)])))
     else:
         every = rng.choice((1, -1), size=(4096, seeds))
-    flipped, changed = drawn @ every.T, every.sum(axis=1)  # sums without an effect, and the change by an effect of 1
-
-    def power(effect: float) -> float:
-        larger = np.abs(flipped + effect * changed) >= np.abs(drawn.sum(axis=1, keepdims=True) + effect * seeds) - 1e-12
-        return float(np.mean(larger.mean(axis=1) <= ALPHA / tests))
-
-    low, high = 0.0, 20.0
-    for _ in range(14):
-        middle = (low + high) / 2
-        low, high = (middle, high) if power(middle) < POWER else (low, middle)
-    return high
+    flipped, changed, sums = drawn @ every.T, every.sum(axis=1), drawn.sum(axis=1, keepdims=True)
+    # An effect moves the data's sum by `seeds` times itself, and a flip's by `changed`: up to `last` the flip's is as large.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        last = np.fmax((flipped - sums) / (seeds - changed), -(flipped + sums) / (seeds + changed))
+    last[:, changed == seeds] = np.inf  # the data itself
+    rank = len(every) - 1 - int(ALPHA / tests * len(every) + 1e-9)  # all above it may be as large
+    needed = np.partition(last, rank, axis=1)[:, rank]
+    return float(np.quantile(needed, POWER, method="inverted_cdf"))
 
 
 def compare(learner: str, task: str, scores: dict[str, Scores], arms: Sequence[Arm], tests: int | None = None) -> list[Row]:
