@@ -1,6 +1,6 @@
 """Run folders made by an attacker: each tries to run code, to read or write elsewhere, or to end a command badly.
 
-    python bench/reliability_hostile.py FOLDER COUNT SEED
+    python bench/reliability.py --parts hostile
 
 `hostile` makes cases from a seed, opens each with a command in a separate process, and returns the faults. A case is a whole
 run, or a sweep, of the point mass with one to three changes. All digests are forged so that they agree.
@@ -16,7 +16,6 @@ import shutil
 import signal
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 from reliability_pairs import ROOT, SHAPES
@@ -320,8 +319,3 @@ def hostile(folder, count=200, seed=0):
             shutil.rmtree(case.place)
     done = f"{count} folders that name code, link elsewhere or are damaged, opened by {len(COMMANDS)} commands"
     return done, f"no code ran; {ended.get(2, 0)} errors with status 2, {ended.get(0, 0)} without effect", faults
-
-
-if __name__ == "__main__":
-    for line in hostile(Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])):
-        print(line)

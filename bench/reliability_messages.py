@@ -1,12 +1,11 @@
 """Hostile messages to every port that a command opens: of the viewer, of JAX's processes, and of Ray.
 
-    python bench/reliability_messages.py [--messages 200] [--seed 0] [--programs view distributed ray]
+    python bench/reliability.py --parts messages [--messages 200] [--seed 0]
 
 Needs the extras `view`, `ray` and `test`. Each program is the real command. After its messages it must still do its work, a
 legitimate client of the viewer must still be served, and memory must not have grown.
 """
 
-import argparse
 import asyncio
 import contextlib
 import math
@@ -17,7 +16,6 @@ import socket
 import struct
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -26,10 +24,10 @@ import psutil
 import viser
 import viser._messages
 import zstandard
+from reliability_pairs import ROOT
 from websockets.asyncio.client import connect
 from websockets.exceptions import WebSocketException
 
-ROOT = Path(__file__).parent.parent
 PROTOCOL = f"viser-v{viser.__version__}"
 CAMERA = {"type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [3, 3, 3], "fov": 1, "near": 0.01, "far": 1000}
 CAMERA |= {"image_height": 600, "image_width": 800, "look_at": [0, 0, 0], "up_direction": [0, 0, 1]}
@@ -320,29 +318,15 @@ def ray(folder, number, seed):
 PROGRAMS = {"view": view, "distributed": distributed, "ray": ray}
 
 
-def messages(folder, number, seed, programs=tuple(PROGRAMS)):
+def messages(folder, number, seed):
     """Attacks each program. Returns the number of ports, and a line per fault."""
     tried, wrong = 0, []
-    for name in programs:
+    for name, attack in PROGRAMS.items():
         Path(folder, name).mkdir(parents=True)
-        ports, faults = PROGRAMS[name](Path(folder, name), number, seed)
+        ports, faults = attack(Path(folder, name), number, seed)
         print(
             f"{name}: {number} messages to each of {ports} ports: {'; '.join(faults) or 'nothing ended or blocked'}", flush=True
         )
         tried += ports
         wrong += [f"{name}: {fault}" for fault in faults]
     return tried, wrong
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--messages", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--programs", nargs="+", choices=PROGRAMS, default=list(PROGRAMS))
-    args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        return int(bool(messages(Path(folder), args.messages, args.seed, args.programs)[1]))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -23,7 +23,6 @@ import reliability_pairs
 
 from mjx_dher.runs.folder import run_folder
 
-ROOT = Path(__file__).parent.parent
 SECONDS = 10.0  # time limit for a command to end
 LONG = ["--total-steps", "20000", "--checkpoint-every", "0"]
 GRID = ["sweep", *reliability_pairs.SHAPES, "--sampler", "future", "--seeds", "2", "--lanes", "1", *LONG]
@@ -71,7 +70,9 @@ class Trials:
         elif self.name != "view":
             argv = [*argv, "--out", str(out)]
         pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
-        return subprocess.Popen([sys.executable, "-u", "train.py", *argv], cwd=ROOT, env={**os.environ, "MARK": mark}, **pipes)
+        return subprocess.Popen(
+            [sys.executable, "-u", "train.py", *argv], cwd=reliability_pairs.ROOT, env={**os.environ, "MARK": mark}, **pipes
+        )
 
     def _left(self, out: Path) -> object:
         """Faults that an ended command has left."""

@@ -45,45 +45,31 @@ class Comparison(NamedTuple):
     against: tuple[str, str] | None = None
 
 
-def _readings() -> list[Comparison]:
-    """Readings other than the default one, on each task."""
-    linear = {"push": ("sum", "max", "minmax", "none", "far"), "pick_and_place": ("sum", "minmax", "far")}
-    softmax = {"push": ("mean", "none")}
-    found = []
-    for task in NAMES:
-        for normalization in linear.get(task, linear["pick_and_place"]):
-            found.append(Comparison(task, f"readings_{task}", f"weighted, {normalization}, linear"))
-        for normalization in softmax.get(task, ("none",)):
-            found.append(Comparison(task, f"readings_{task}_softmax", f"weighted, {normalization}, softmax"))
-    return found
+def _readings(task: str, prefix: str = "", against: tuple[str, str] | None = None) -> list[Comparison]:
+    """Readings other than the default one."""
+    linear = ("sum", "max", "minmax", "none", "far") if task == "push" else ("sum", "minmax", "far")
+    softmax, sweep = ("mean", "none") if task == "push" else ("none",), f"readings_{prefix}{task}"
+    return [Comparison(task, sweep, f"weighted, {name}, linear", against) for name in linear] + [
+        Comparison(task, f"{sweep}_softmax", f"weighted, {name}, softmax", against) for name in softmax
+    ]
+
+
+def _own(sweep: str, *settings: str) -> list[Comparison]:
+    """Settings of Push with the paper's own cycles."""
+    return [Comparison("push", sweep, setting, (OWN["push"], "future")) for setting in settings]
 
 
 OWN = {task: f"own_{task}" for task in NAMES}  # the sweeps with the paper's own cycles, in float32
 FAMILIES: dict[str, list[Comparison]] = {
     "the paper's own cycles": [Comparison(task, sweep, "weighted", (sweep, "future")) for task, sweep in OWN.items()],
-    "methods 1 and 2, own cycles": [
-        Comparison("push", "own_methods", name, (OWN["push"], "future")) for name in ("closest", "epsilon_closest")
-    ],
-    "readings, own cycles": [
-        Comparison("push", "readings_own_push", f"weighted, {name}, linear", (OWN["push"], "future"))
-        for name in ("sum", "max", "minmax", "none", "far")
-    ]
-    + [
-        Comparison("push", "readings_own_push_softmax", f"weighted, {name}, softmax", (OWN["push"], "future"))
-        for name in ("mean", "none")
-    ],
-    "k against 4, own cycles": [
-        Comparison("push", "k_own_push", f"future, her_k {k}", (OWN["push"], "future")) for k in (1, 2, 8, 16)
-    ],
-    "final and random, own cycles": [
-        Comparison("push", "samplers_own_push", name, (OWN["push"], "future")) for name in ("final", "random")
-    ],
-    "ring and noise, own cycles": [
-        Comparison("push", "ring_own_push", "future, ring of 200,000", (OWN["push"], "future")),
-        Comparison("push", "noise_own_push", "future, random_noise 0", (OWN["push"], "future")),
-    ],
+    "methods 1 and 2, own cycles": _own("own_methods", "closest", "epsilon_closest"),
+    "readings, own cycles": _readings("push", "own_", (OWN["push"], "future")),
+    "k against 4, own cycles": _own("k_own_push", *(f"future, her_k {k}" for k in (1, 2, 8, 16))),
+    "final and random, own cycles": _own("samplers_own_push", "final", "random"),
+    "ring and noise, own cycles": _own("ring_own_push", "future, ring of 200,000")
+    + _own("noise_own_push", "future, random_noise 0"),
     "the paper's claim": [Comparison(task, sweep, "weighted") for task, sweep in MAIN.items()],
-    "readings": _readings(),
+    "readings": [comparison for task in NAMES for comparison in _readings(task)],
     "method 2": [Comparison("push", "samplers", f"epsilon_closest, epsilon {e}") for e in (0.1, 0.2, 0.3, 0.5)]
     + [Comparison("push", "samplers", "closest")],
     "k against 4": [Comparison(task, f"k_{task}", f"future, her_k {k}") for task in NAMES for k in (1, 2, 8, 16)],

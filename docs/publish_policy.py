@@ -5,7 +5,6 @@ policy here and, if the originals' environment is set up (`train.py transfer --s
 """
 
 import argparse
-import dataclasses
 import datetime
 import shutil
 import sys
@@ -19,7 +18,7 @@ sys.path.insert(0, str(ROOT))
 
 from mjx_dher import envs, presets, spec  # noqa: E402
 from mjx_dher.policy import bundled  # noqa: E402
-from mjx_dher.runs.folder import reading, results, run_folder  # noqa: E402
+from mjx_dher.runs.folder import fingerprint, reading, results, run_folder  # noqa: E402
 from mjx_dher.spec import RunSpec  # noqa: E402
 from mjx_dher.system import files  # noqa: E402
 
@@ -39,21 +38,11 @@ def _arguments(preset: str, run: RunSpec) -> list[str]:
     given = ["--env", run.env, "--preset", preset]
     if run.learner != presets.preset(preset, run.env).learner:
         given += ["--learner", run.learner]
-    for owner, default in ((run, base), (run.config, base.config), (run.hparams, base.hparams)):
-        for name, value in _fields(owner).items():
-            if name not in ("env", "learner", "config", "hparams") and value != _fields(default)[name]:
-                given += [f"--{name.replace('_', '-')}", *map(_text, value if isinstance(value, tuple) else (value,))]
-    return given if "--seed" in given else [*given, "--seed", str(run.seed)]
-
-
-def _fields(owner: Any) -> dict[str, Any]:
-    if dataclasses.is_dataclass(owner):
-        return {field.name: getattr(owner, field.name) for field in dataclasses.fields(owner)}
-    return dict(owner._asdict())
-
-
-def _text(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    default = fingerprint.settings(base)
+    for name, value in fingerprint.settings(run).items():
+        if name not in ("env", "learner") and value != default[name]:
+            given += [f"--{name.replace('_', '-')}", *fingerprint.text(value).split(" ")]
+    return [*given, "--seed", str(run.seed)]
 
 
 def card(folder: Path) -> str:
@@ -74,9 +63,9 @@ def card(folder: Path) -> str:
         "versions": ", ".join(f"{name} {versions[name]}" for name in ("jax", "mujoco", "numpy", "python")),
         "published": facts["date"],
     }
-    today = {*_fields(run.config), *_fields(run.hparams)}  # an option that was removed since had its default
+    today = fingerprint.settings(run)  # an option that was removed since had its default
     settings = {name: value for name, value in {**content["config"], **content["hparams"]}.items() if name in today}
-    numbers = ", ".join(f"{name} {' '.join(map(str, x)) if isinstance(x, list) else _text(x)}" for name, x in settings.items())
+    numbers = ", ".join(f"{name} {fingerprint.text(value)}" for name, value in settings.items())
     return "\n".join(
         (
             f"# The policy `{folder.name}`",
