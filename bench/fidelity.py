@@ -277,21 +277,29 @@ def replay_original(env, recorded, shift, rng):
     return np.array(grips), np.array(ends)
 
 
-def yardstick():
-    """Writes the report's numbers for the originals, replayed from starts moved by SHIFTS."""
+def yardstick(path, head, recordings, kinds, replay, figures):
+    """Writes the figures of originals, replayed from starts moved by SHIFTS.
+
+    Args:
+      path, head: CSV file, and its columns.
+      recordings: name of each task's file, and the array of its episodes' kinds.
+      replay: arrays of replayed episodes, from an original, its recording, a shift in m and random numbers.
+      figures: cells of a row, from a recording, those arrays and the indices of their episodes.
+    """
     rng = np.random.default_rng(0)
-    with open(YARDSTICK, "w", encoding="utf-8", newline="") as file:
+    with open(path, "w", encoding="utf-8", newline="") as file:
         out = csv.writer(file)
-        out.writerow(HEAD)
-        for task in TASKS:
-            env, recorded = make_original(task), load(f"fetch_{task}")
+        out.writerow(head)
+        for name, kind in recordings:
+            task, recorded = name.partition("_")[2], load(name)
+            env = make_original(task)
             for shift in SHIFTS:
-                runs = [replay_original(env, recorded, shift, rng) for _ in range(DIRECTIONS if shift else 1)]
-                grip, ends = (np.concatenate(parts) for parts in zip(*runs))
-                for kind, name in enumerate(KINDS):
-                    of = np.flatnonzero(recorded["policy"] == kind)
-                    rows = (len(recorded["policy"]) * np.arange(len(runs))[:, None] + of).ravel()
-                    row = (task, name, run_by(shift), *figures(recorded, grip[rows], ends[rows], np.tile(of, len(runs))))
+                runs = DIRECTIONS if shift else 1
+                parts = [np.concatenate(part) for part in zip(*(replay(env, recorded, shift, rng) for _ in range(runs)))]
+                of = np.tile(np.arange(len(recorded[kind])), runs)
+                for number, said in enumerate(kinds):
+                    rows = recorded[kind][of] == number
+                    row = (task, said, run_by(shift), *figures(recorded, *(part[rows] for part in parts), of[rows]))
                     out.writerow(row)
                     print(*row, flush=True)
 
@@ -303,7 +311,7 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=TASKS)
     args = parser.parse_args()
     if args.mode == "yardstick":
-        return yardstick()
+        return yardstick(YARDSTICK, HEAD, [(f"fetch_{task}", "policy") for task in TASKS], KINDS, replay_original, figures)
     block, recorded, paths = report(args.tasks, args.engines)
     print(block)
     if set(args.tasks) == set(TASKS) and set(args.engines) == set(ENGINES):

@@ -26,12 +26,11 @@ tests/data/hand_TASK.npz has E episodes of T steps, and every tenth state:
 """
 
 import argparse
-import csv
 import sys
 from typing import Any
 
 import numpy as np
-from fidelity import DATA, DIRECTIONS, OPTIONS, SHIFTS, load, make_original, moved_originals, put_into_document, run_by
+from fidelity import DATA, OPTIONS, load, make_original, moved_originals, put_into_document, yardstick
 
 YARDSTICK = DATA / "hand_yardstick.csv"
 BEGIN, END = "<!-- hands: begin -->", "<!-- hands: end -->"
@@ -175,7 +174,7 @@ def record(seed=0):
 
 
 def replay_original(env, recorded, shift, rng):
-    """Kept states [E, T/10 + 1, nq] in the original, from starts that are moved by `shift` in a random direction."""
+    """Kept states [E, T/10 + 1, nq], alone in a tuple, in the original, from starts moved by `shift` in a random direction."""
     import mujoco
 
     paths = []
@@ -193,25 +192,7 @@ def replay_original(env, recorded, shift, rng):
             if step % KEPT == KEPT - 1:
                 path.append(env.data.qpos[:nq].copy())
         paths.append(path)
-    return np.array(paths)
-
-
-def yardstick():
-    """Writes the figures of the originals, replayed from starts moved by SHIFTS."""
-    rng = np.random.default_rng(0)
-    with open(YARDSTICK, "w", encoding="utf-8", newline="") as file:
-        out = csv.writer(file)
-        out.writerow(HEAD)
-        for task in TASKS:
-            env, recorded = make_original(task), load(f"hand_{task}")
-            for shift in SHIFTS:
-                runs = DIRECTIONS if shift else 1
-                paths = np.concatenate([replay_original(env, recorded, shift, rng) for _ in range(runs)])
-                every = np.tile(np.arange(EPISODES), runs)
-                for kind, name in enumerate(KINDS):
-                    pick = recorded["kind"][every] == kind
-                    out.writerow((task, name, run_by(shift), *figures(recorded, paths[pick], every[pick])))
-        print(YARDSTICK.read_text())
+    return (np.array(paths),)
 
 
 def main() -> None:
@@ -222,8 +203,10 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=EPISODES)
     parser.add_argument("--steps", type=int, default=100)
     args = parser.parse_args()
-    if args.mode != "report":
-        return {"record": record, "yardstick": yardstick}[args.mode]()
+    if args.mode == "record":
+        return record()
+    if args.mode == "yardstick":
+        return yardstick(YARDSTICK, HEAD, [(f"hand_{task}", "kind") for task in TASKS], KINDS, replay_original, figures)
     block = report(args.tasks, args.engines, args.episodes, args.steps)
     print(block)
     if set(args.tasks) == set(TASKS) and (args.episodes, args.steps) == (EPISODES, 100):
