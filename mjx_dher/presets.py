@@ -118,10 +118,9 @@ def _frugal(env: str) -> RunSpec:
     return base.replace(cycles_per_epoch=5, updates_per_cycle=200, total_steps=steps)
 
 
-def _entropy(env: str, **changes: Any) -> RunSpec:
-    """Base settings of the PickAndPlace presets with `tqc`, and `changes`."""
-    base = _gpu(env).replace(num_envs=512, updates_per_cycle=1000, total_steps=1_000_000, action_l2=0.0, entropy_weight=0.1)
-    return base.replace(**changes)
+def _entropy(env: str) -> RunSpec:
+    """Base settings of the PickAndPlace presets with `tqc`."""
+    return _gpu(env).replace(num_envs=512, updates_per_cycle=1000, total_steps=1_000_000, action_l2=0.0, entropy_weight=0.1)
 
 
 def _gpu_hand(env: str) -> RunSpec:
