@@ -74,10 +74,11 @@ def _smallest_effect(seeds: int, tests: int) -> float:
     else:
         every = rng.choice((1, -1), size=(4096, seeds))
     flipped, changed, sums = drawn @ every.T, every.sum(axis=1), drawn.sum(axis=1, keepdims=True)
-    # An effect moves the data's sum by `seeds` times itself, and a flip's by `changed`: up to `last` the flip's is as large.
+    # An effect moves the data's sum, then positive, by `seeds` times itself, and a flip's by `changed`. Up to `last` the flip's
+    # is as large.
     with np.errstate(divide="ignore", invalid="ignore"):
         last = np.fmax((flipped - sums) / (seeds - changed), -(flipped + sums) / (seeds + changed))
-    last[:, changed == seeds] = np.inf  # the data itself
+    last[:, np.abs(changed) == seeds] = np.inf  # the data itself, or all of it flipped
     rank = len(every) - 1 - int(ALPHA / tests * len(every) + 1e-9)  # all above it may be as large
     needed = np.partition(last, rank, axis=1)[:, rank]
     return float(np.quantile(needed, POWER, method="inverted_cdf"))

@@ -277,14 +277,15 @@ def replay_original(env, recorded, shift, rng):
     return np.array(grips), np.array(ends)
 
 
-def yardstick(path, head, recordings, kinds, replay, figures):
+def yardstick(path, head, recordings, kinds, replay, cells):
     """Writes the figures of originals, replayed from starts moved by SHIFTS.
 
     Args:
       path, head: CSV file, and its columns.
-      recordings: name of each task's file, and the array of its episodes' kinds.
+      recordings: name of each task's file, and of its array with the kind of each episode, an index into `kinds`.
+      kinds: names of the kinds.
       replay: arrays of replayed episodes, from an original, its recording, a shift in m and random numbers.
-      figures: cells of a row, from a recording, those arrays and the indices of their episodes.
+      cells: last cells of a row, from a recording, those arrays and the indices of their episodes.
     """
     rng = np.random.default_rng(0)
     with open(path, "w", encoding="utf-8", newline="") as file:
@@ -299,7 +300,7 @@ def yardstick(path, head, recordings, kinds, replay, figures):
                 of = np.tile(np.arange(len(recorded[kind])), runs)
                 for number, said in enumerate(kinds):
                     rows = recorded[kind][of] == number
-                    row = (task, said, run_by(shift), *figures(recorded, *(part[rows] for part in parts), of[rows]))
+                    row = (task, said, run_by(shift), *cells(recorded, *(part[rows] for part in parts), of[rows]))
                     out.writerow(row)
                     print(*row, flush=True)
 

@@ -251,7 +251,7 @@ APART: dict[str, Any] = {
     "splices": lambda folder, args: reliability_splices.splices(folder),
     "disks": lambda folder, args: reliability_machines.disks(folder),
     "containers": lambda folder, args: reliability_machines.containers(folder),
-    "hostile": lambda folder, args: reliability_hostile.hostile(folder),
+    "hostile": lambda folder, args: reliability_hostile.hostile(folder, seed=args.seed),
 }
 
 

@@ -21,6 +21,7 @@ from mjx_dher import envs, learners, presets, priorities, samplers, stats
 from mjx_dher.cli.settings import check_writable
 from mjx_dher.contract import env_spec
 from mjx_dher.evaluate import play_policy
+from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.loop import train
 from mjx_dher.system.files import FolderError
 from mjx_dher.system.machine import keep_compiled_programs
@@ -38,6 +39,13 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="changes to the preset")
     parser.add_argument("--out", type=Path, help="CSV of every evaluation of every seed")
     args = parser.parse_args()
+    try:
+        args.spec = presets.preset(args.preset, args.env)
+        known = fingerprint.settings(args.spec)
+        changes = (change.partition("=") for change in args.set)
+        args.spec = args.spec.replace(**{name: type(known.get(name, ""))(value) for name, _, value in changes})
+    except ValueError as error:
+        parser.error(str(error))
     if args.seeds < 1:
         parser.error(f"--seeds is 1 or more; got {args.seeds}")
     if args.out:
@@ -52,10 +60,7 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     args = parse()
-    spec = presets.preset(args.preset, args.env)
-    known = {**vars(spec.config), **spec.hparams._asdict()}
-    spec = spec.replace(**{name: type(known[name])(value) for name, _, value in (change.partition("=") for change in args.set)})
-    config, hparams = spec.config, spec.hparams
+    spec, config, hparams = args.spec, args.spec.config, args.spec.hparams
     env = envs.make(args.env, engine=args.engine)
     learner = learners.make(spec.learner, config, env_spec(env), spec.networks)
     parts: dict[str, Any] = {"sampler": samplers.make(args.sampler), "priority": priorities.make(spec.priority)}

@@ -1,4 +1,4 @@
-"""Presets on seeds that had no part in choosing them: success over 500 episodes of seeds 600 to 609 (or 610 to 619).
+"""Presets on seeds that had no part in choosing them: success over 500 episodes of ten seeds from 600 on.
 
     python bench/unseen.py --out unseen --learners cpu --tasks reach push --first-seed 600 --minutes 9
     python bench/unseen.py --out unseen --learners cpu --tasks reach push --first-seed 600 --report

@@ -41,7 +41,8 @@ def _arguments(preset: str, run: RunSpec) -> list[str]:
     default = fingerprint.settings(base)
     for name, value in fingerprint.settings(run).items():
         if name not in ("env", "learner") and value != default[name]:
-            given += [f"--{name.replace('_', '-')}", *fingerprint.text(value).split(" ")]
+            words = map(str, value) if isinstance(value, tuple) else [fingerprint.text(value)]
+            given += [f"--{name.replace('_', '-')}", *words]
     return [*given, "--seed", str(run.seed)]
 
 

@@ -35,7 +35,8 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
     Args:
       learner: learner. Default: the preset's, which may bring its own numbers and priority. Others use the numbers of `ddpg`.
       networks: networks. Default: the preset's for this learner.
-      **changes: other settings (`RunSpec.replace`), such as `sampler`, `seed` or `num_envs`.
+      **changes: other settings (`RunSpec.replace`), such as `sampler`, `seed` or `num_envs`. A whole `config` or `hparams`
+        replaces all of the preset's.
 
     Raises:
       ValueError: there is no such preset or setting.

@@ -62,14 +62,14 @@ class RunSpec:
 
     def replace(self, **settings: Any) -> "RunSpec":
         """Copy with other settings, by the names of fields of RunSpec, Config or HParams. Raises ValueError for other names."""
-        numbers = {name: settings.pop(name) for name in HParams._fields if name in settings}
-        sizes = {field.name: settings.pop(field.name) for field in dataclasses.fields(Config) if field.name in settings}
-        fields = [field.name for field in dataclasses.fields(self)]
+        fields, sizes = ([field.name for field in dataclasses.fields(owner)] for owner in (RunSpec, Config))
         for name in settings:
-            check_name("a setting", name, (*fields, *vars(self.config), *HParams._fields))
-        config, hparams = settings.pop("config", self.config), settings.pop("hparams", self.hparams)
-        config, hparams = dataclasses.replace(config, **sizes), hparams._replace(**numbers)
-        return dataclasses.replace(self, config=config, hparams=hparams, **settings)
+            check_name("a setting", name, (*fields, *sizes, *HParams._fields))
+        if own := {name: settings.pop(name) for name in sizes if name in settings}:
+            settings["config"] = dataclasses.replace(settings.get("config", self.config), **own)
+        if own := {name: settings.pop(name) for name in HParams._fields if name in settings}:
+            settings["hparams"] = settings.get("hparams", self.hparams)._replace(**own)
+        return dataclasses.replace(self, **settings)
 
     @property
     def env_arguments(self) -> dict[str, Argument]:

@@ -71,9 +71,12 @@ def expected(env, episodes, row, step, goal, n_step):
     return reward, 0.0 if terminal else HP.gamma ** (i + 1), end
 
 
-# A sampler sees neither the number of steps nor the end at the goal, so that two samplers have all combinations.
-COMBINED = [(True, 3, name) for name in (*COMPONENTS["sampler"], "custom")]
-COMBINED += [(*case, name) for case in ((False, 1), (False, 3), (True, 1)) for name in ("future", "random")]
+# A sampler sees neither the number of steps nor the end at the goal, so that two samplers have all combinations by default.
+COMBINED = [
+    pytest.param(*case, name, marks=[] if case == (True, 3) or name in ("future", "random") else pytest.mark.slow)
+    for case in ((False, 1), (False, 3), (True, 1), (True, 3))
+    for name in (*COMPONENTS["sampler"], "custom")
+]
 
 
 @pytest.mark.parametrize(("walk", "n_step", "name"), COMBINED, indirect=["walk"])

@@ -65,7 +65,7 @@ def test_a_run_is_read_however_it_ended(made, status, tmp_path):
     assert np.isnan(curve.column("nothing")).all()
     assert "12,000 steps in 24 s" in curves.title(curve)
     assert status in curves.title(curve)
-    if status == "failed":  # whose picture has the most in it
+    if status != "finished":  # which others draw
         assert figures.to_svg(curves.draw_curve(curve), 0).startswith("<svg")
 
 

@@ -234,7 +234,7 @@ def test_an_aim_is_the_mean_of_three_evaluations():
 @pytest.mark.slow
 def test_a_run_that_has_reached_its_aim_ends_there_also_after_a_stop(tmp_path):
     """The mean of three evaluations: those before the stop count."""
-    spec = dataclasses.replace(SPEC, config=dataclasses.replace(CONFIG, total_steps=200, eval_episodes=200))
+    spec = SPEC.replace(total_steps=200, eval_episodes=200)
     env, rates, lines = PointMass(), [], []
     options = Options(final_episodes=2)
 
@@ -286,7 +286,7 @@ def test_a_run_that_diverged_counts_as_a_failure_from_then_on():
 
 
 def test_runs_that_cannot_share_a_program_are_refused(tmp_path):
-    other = dataclasses.replace(SPEC, config=dataclasses.replace(CONFIG, batch_size=17))
+    other = SPEC.replace(batch_size=17)
     for specs, folders in (([SPEC, other], ["a", "b"]), ([SPEC], ["a", "b"]), ([], [])):
         with refuses("RunSpec.program"):
             mjx_dher.train_runs(PointMass(), specs, [tmp_path / name for name in folders])

@@ -195,7 +195,7 @@ def test_the_table_of_presets_is_that_of_the_file():
 
 FIRST_UNSEEN = {  # where not 600: the preset had changed since
     **dict.fromkeys((("cpu", "pick_and_place"), ("gpu", "egg_rotate"), ("gpu", "block_rotate_z")), 610),
-    **dict.fromkeys((("gpu", "block_rotate_parallel"), ("gpu", "block_rotate_xyz")), 620),
+    **dict.fromkeys((("gpu", "block_rotate_parallel"), ("gpu", "block_rotate_xyz"), ("cpu", "slide")), 620),
 }
 
 
@@ -213,13 +213,11 @@ def test_the_table_of_unseen_seeds_is_of_the_file():
     }
     assert shown.keys() == finals.keys()
     for of, values in finals.items():
-        assert len(values) == (8 if of == ("cpu", "slide") else 10)
+        assert len(values) == (3 if of == ("cpu", "slide") else 10)
         error = max(scipy.stats.sem(values), 1e-9)  # all can be 1
         low, high = scipy.stats.t.interval(0.95, len(values) - 1, np.mean(values), error)
         numbers = (min(values), np.median(values), max(values), np.mean(values), low, min(high, 1.0))
         assert shown[of] == [f"{number:.3f}" for number in numbers], of
-    slide = finals["cpu", "slide"]
-    assert f"{min(slide):.3f} to {max(slide):.3f} (cores)" in (ROOT / "README.md").read_text()
 
 
 def test_the_readme_s_ranges_are_of_these_seeds_and_of_the_originals():

@@ -29,7 +29,7 @@ from mjx_dher.tools import curves
 from point_mass import PointMass
 
 OTHER = dataclasses.replace(SPEC, seed=1)
-LONGER = dataclasses.replace(SPEC, config=dataclasses.replace(SPEC.config, total_steps=320))  # 8 epochs
+LONGER = SPEC.replace(total_steps=320)  # 8 epochs
 
 
 @pytest.fixture(scope="module")
