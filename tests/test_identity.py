@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import itertools
 import json
 import math
 import shutil
@@ -207,12 +208,17 @@ def test_fewer_steps_than_were_made_are_refused_and_nothing_is_lost(stopped, cap
     assert resume(stopped, capsys)[0] == 0
 
 
-def test_options_may_change(stopped, whole, capsys):
-    flags = ["--log", "jsonl", "--keep", "1", "--final-episodes", "7", "--checkpoint-every", "0"]
-    status, text = resume(stopped, capsys, *flags)
+OPTIONS = {"--log": "jsonl", "--keep": "1", "--final-episodes": "7", "--checkpoint-every": "0"}
+
+
+@pytest.mark.parametrize("flags", [OPTIONS, *(pytest.param({flag: OPTIONS[flag]}, marks=pytest.mark.slow) for flag in OPTIONS)])
+def test_options_may_change(stopped, whole, capsys, flags):
+    status, text = resume(stopped, capsys, *itertools.chain(*flags.items()))
     assert status == 0, text
-    names(text, "keep 1", "final_episodes 7", "checkpoint_every 0")
+    names(text, *(f"{flag[2:].replace('-', '_')} {value}" for flag, value in flags.items() if flag != "--log"))
     assert rows_of(stopped) == rows_of(whole)
+    if "--log" not in flags:
+        return
     lines = [json.loads(line) for line in (stopped / "metrics.jsonl").read_text().splitlines()]
     assert [line["epoch"] for line in lines] == [1, 2, 3, 4, 5, 6]
     assert [f"{line['critic_loss']:.6g}" for line in lines] == [row["critic_loss"] for row in rows_of(whole)]
@@ -225,12 +231,13 @@ def test_an_option_of_another_type_is_refused(stopped, capsys, name, value):
     assert (status, name in text, "Traceback" in text) == (2, True, False), text
 
 
-def test_metrics_that_lag_behind_a_checkpoint_make_resume_take_the_one_before(stopped, whole, capsys):
+@pytest.mark.parametrize("lines", [3, pytest.param(4, marks=pytest.mark.slow)])
+def test_metrics_that_lag_behind_a_checkpoint_make_resume_take_the_one_before(stopped, whole, capsys, lines):
     """As a power cut leaves them, the last line cut."""
     content = (stopped / "metrics.csv").read_text().splitlines(keepends=True)
-    (stopped / "metrics.csv").write_text("".join(content[:3]) + content[3][:-5])
+    (stopped / "metrics.csv").write_text("".join(content[:lines]) + content[lines][:-5])
     status, text = resume(stopped, capsys)
-    assert "epoch-000004 has a later epoch than the last complete line of metrics.csv, 2" in text
+    assert f"epoch-000004 has a later epoch than the last complete line of metrics.csv, {lines - 1}" in text
     assert (status, "epoch-000002, after epoch 2" in text) == (0, True)
     assert rows_of(stopped) == rows_of(whole)
 

@@ -167,7 +167,12 @@ THROUGH = [
 
 @pytest.mark.parametrize(
     ("command", "kind", "name", "flags"),
-    [*(("train", *mistake) for mistake in THROUGH), ("sweep", *THROUGH[2]), ("check", *THROUGH[2])],
+    [
+        *(("train", *mistake) for mistake in THROUGH),
+        *(("sweep", *THROUGH[2]), ("check", *THROUGH[2])),
+        pytest.param("check", *THROUGH[3], marks=pytest.mark.slow),
+        *(pytest.param("train", "env", name, [], marks=pytest.mark.slow) for name in ("RewardOfTwoAxes", "NoSteps")),
+    ],
 )
 def test_each_is_named_by_the_command_before_anything_is_compiled(tmp_path, capsys, monkeypatch, kind, name, flags, command):
     monkeypatch.setattr(driver.program_lib, "compile_runs", lambda *args: pytest.fail("compiled"))

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -185,18 +186,30 @@ def test_a_part_that_is_none_is_refused(folder, monkeypatch, part, capsys):
     monkeypatch.chdir(folder)
     flag = "--" + part.replace("_", "-")
     default = getattr(RunSpec(), part)
-    value = {"my_tasks:TWO": ["must be a function", "2"]} if part in ("metric", "generator") else {}  # after the others
     for name, said in {
         default[:-1]: [repr(default[:-1]), repr(default), "module:attribute"],
         "my_task:x": ["'my_task'", "'my_tasks'", "no module"],
         "my_tasks:tracd": ["'my_tasks:tracd'", "'traced'"],
-        **value,
     }.items():
-        assert cli.main([*OWN, "--sampler", "weighted", flag, name, "--total-steps", "20", "--out", "refused"]) == 2
-        error = capsys.readouterr().err
-        assert error.startswith("error: ")
-        assert all(word in error for word in (part, *said)), error
-    assert not (folder / "refused").exists()
+        check_refusal(capsys, flag, name, part, *said)
+
+
+def check_refusal(capsys, flag, name, *words):
+    assert cli.main([*OWN, "--sampler", "weighted", flag, name, "--total-steps", "20", "--out", "refused"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert all(word in error for word in words), error
+    assert not Path("refused").exists()
+
+
+# It is refused later than other names, when parts are tried.
+@pytest.mark.parametrize(
+    "part",
+    [pytest.param(x, marks=[] if x in ("metric", "generator") else pytest.mark.slow) for x in (*PARTS, "weight_kernel")],
+)
+def test_a_part_that_is_no_function_is_refused(folder, monkeypatch, part, capsys):
+    monkeypatch.chdir(folder)
+    check_refusal(capsys, "--" + part.replace("_", "-"), "my_tasks:TWO", part, "must be a function", "2")
 
 
 def test_its_policy_needs_no_module(folder):

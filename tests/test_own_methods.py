@@ -94,13 +94,18 @@ def test_an_own_observation_may_be_longer_and_its_class_may_vouch_for_the_layout
     for task in (Longer, Vouched, Both):
         env = task("native")
         assert (env.observation_size, env.spec.observation.shape) == (7, (7,))
-    check_env(Longer("native"))
     for task in (Vouched, Both):
         assert task("native").robot_interface == Reach("native").robot_interface
     assert type("Mixed", (Longer,), {"describe": Reach.describe})("native").observation_size == 7
     fetch = type("Short", (Push,), {"observe": lambda self, physics: Push.observe(self, physics)[:9]})("native")
     assert (fetch.observation_size, list(fetch.robot_interface)) == (9, ["controls", "own"])
     check_env(fetch)
+
+
+# Their physics is the same, and so are their observations.
+@pytest.mark.parametrize("task", [Longer, *(pytest.param(task, marks=pytest.mark.slow) for task in (Vouched, Both))])
+def test_tasks_with_a_longer_observation_pass_the_check(task):
+    check_env(task("native"))
 
 
 def test_an_own_method_may_use_what_its_constructor_sets_later_and_varied_factors():

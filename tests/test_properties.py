@@ -13,7 +13,7 @@ from test_replay import T, make_episodes, make_ring
 from mjx_dher import config, replay, validation
 from mjx_dher.config import Config, HParams, Number
 
-every_run_alike = settings(deadline=None, max_examples=30, derandomize=True)
+every_run_alike = settings(deadline=None, max_examples=60, derandomize=True)
 
 INTERVALS = {name: number.interval for owner in (Config, HParams) for name, number in config.metadata(owner, Number).items()}
 SIZES = [name for name in config.metadata(Config, Number) if name != "hidden_sizes"]

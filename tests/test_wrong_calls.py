@@ -118,7 +118,11 @@ DOCTOR = (
 
 @pytest.mark.parametrize(
     ("redirect", "expected"),
-    [("> /dev/full", 2), ("| head -1 > /dev/null; exit ${PIPESTATUS[0]}", 141)],
+    [
+        ("> /dev/full", 2),
+        ("| head -1 > /dev/null; exit ${PIPESTATUS[0]}", 141),
+        pytest.param(">&-", 2, marks=pytest.mark.slow),
+    ],
 )
 def test_a_command_whose_output_is_its_purpose_ends_with_an_error(redirect, expected):
     status, error = shell(DOCTOR, redirect)
@@ -126,8 +130,9 @@ def test_a_command_whose_output_is_its_purpose_ends_with_an_error(redirect, expe
     assert ("cannot print" in error) == (expected == 2)
 
 
-def test_help_that_cannot_be_printed():
-    status, error = shell("import sys; from mjx_dher import cli; sys.exit(cli.main(['--help']))", "> /dev/full")
+@pytest.mark.parametrize("flag", ["--help", pytest.param("--no-such-flag", marks=pytest.mark.slow)])
+def test_help_that_cannot_be_printed(flag):
+    status, error = shell(f"import sys; from mjx_dher import cli; sys.exit(cli.main(['{flag}']))", "> /dev/full")
     assert (status, "Traceback" in error) == (2, False), error
 
 
