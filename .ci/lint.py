@@ -38,7 +38,7 @@ HABITS_PER_1000_WORDS = {"pages": 2.5, "docstrings": 1.5}
 LONG_SENTENCES = {"pages": 0.05, "docstrings": 0.05}  # share
 CORE = {
     *("types", "config", "validation", "spec", "context", "replay", "samplers", "relabel", "normalizer", "networks"),
-    *("contract", "rollout", "evaluate", "trainer", "learners", "contrib", "by_distance", "priorities"),
+    *("contract", "rollout", "evaluate", "trainer", "mirror", "learners", "contrib", "by_distance", "priorities"),
     "demonstrations",
 }
 Add = Callable[[Path, int, str], None]

@@ -37,6 +37,7 @@ _WITH_OBJECT = {
     **{"object_vel - grip_vel": 3, "object_angvel": 3, "grip_vel": 3, "finger_vel": 2},
 }
 _WITHOUT_OBJECT = {name: _WITH_OBJECT[name] for name in ("grip_pos", "finger_pos", "grip_vel", "finger_vel")}
+_POSITIONS, _ROTATIONS = ("grip_pos", "object_pos"), ("object_euler", "object_angvel")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +90,8 @@ class FetchEnv(SimulatedTask):
     def bind(self) -> None:
         """Looks up arm, fingers and object. These models need no probes."""
         has_object = self.task.object_height is not None
-        self.observation_size = 25 if has_object else 10
+        self._entries = _WITH_OBJECT if has_object else _WITHOUT_OBJECT
+        self.observation_size = sum(self._entries.values())
         self.arm = Chain(self.model, body="gripper", site="grip")
         qpos, qvel = np.zeros(self.model.nq, np.float32), np.zeros(self.model.nv, np.float32)
         # Not at rest: the original's set-up ends with the gripper at a few cm/s.
@@ -113,12 +115,27 @@ class FetchEnv(SimulatedTask):
         """Lowest and highest coordinates [2, 3] of goals in m."""
         return self.task.goal_bounds.astype(np.float32)
 
+    def mirror(self, observation: Array, goal: Array, action: Array) -> tuple[Array, Array, Array]:
+        """Observation [..., D], goal [..., 3] and action [..., 4], mirrored at the vertical plane along x through the start of
+        the gripper. The arm's base lies beside it, so the robot follows its mirror image only nearly (docs/samplers.md).
+        """
+        across = np.array([1.0, -1.0, 1.0], np.float32)
+        shift = np.array([0.0, 2.0 * self.task.initial_grip_pos[1], 0.0], np.float32)
+
+        def image(name: str, entry: Array) -> Array:
+            if entry.shape[-1] == 2:  # the fingers change places
+                return entry[..., ::-1]
+            return entry * (-across if name in _ROTATIONS else across) + (shift if name in _POSITIONS else 0.0)
+
+        parts = jnp.split(observation, np.cumsum([*self._entries.values()])[:-1], axis=-1)
+        seen = jnp.concatenate([image(*part) for part in zip(self._entries, parts)], axis=-1)
+        return seen, goal * across + shift, action * np.append(across, np.float32(1.0))
+
     def describe(self) -> dict[str, Any]:
-        entries = _WITH_OBJECT if self.has_object else _WITHOUT_OBJECT
-        ends = np.cumsum([0, *entries.values()]).tolist()
+        ends = np.cumsum([0, *self._entries.values()]).tolist()
         fingers = {"kind": "JointDelta", "moves": ["finger_r", "finger_l"] if self.drives_fingers else [], "scale": 1.0}
         controls = [{"kind": "Mocap", "moves": ["gripper"], "scale": ACTION_SCALE, "size": 3}, {**fingers, "size": 1}]
-        layout = {name: [begin, end] for name, begin, end in zip(entries, ends, ends[1:])}
+        layout = {name: [begin, end] for name, begin, end in zip(self._entries, ends, ends[1:])}
         return {"controls": controls, "layout": layout, "joints": {"finger_pos": ["finger_r", "finger_l"]}}
 
     @property

@@ -14,7 +14,7 @@ import numpy as np
 from flax import struct
 
 from mjx_dher.contract import check_env_parts, env_spec
-from mjx_dher.types import Array, EnvSpec, GoalObs, PRNGKey, PyTree
+from mjx_dher.types import Array, EnvSpec, GoalObs, MirrorFn, PRNGKey, PyTree
 from mjx_dher.validation import check_number
 
 __all__ = ["ActionDelay", "ActionFilter", "FrameStack", "ObservationNoise", "Wrapper", "WrapperState"]
@@ -202,6 +202,18 @@ class FrameStack(Wrapper):
     def observation_size(self) -> int:
         """Size of n observations."""
         return self._frames * self.env.observation_size
+
+    @property
+    def mirror(self) -> MirrorFn:
+        """The inner environment's `mirror`, applied to each frame. Raises AttributeError if it has none."""
+        inner = self.env.mirror
+
+        def of_frames(observation: PyTree, goal: Array, action: Array) -> tuple[PyTree, Array, Array]:
+            split = jax.tree.map(lambda x: jnp.stack(jnp.split(x, self._frames, axis=-1)), observation)
+            frames = [inner(jax.tree.map(lambda x: x[i], split), goal, action) for i in range(self._frames)]  # noqa: B023
+            return self._join(tuple(frame[0] for frame in frames)), *frames[0][1:]
+
+        return of_frames
 
     @property
     def spec(self) -> EnvSpec:

@@ -29,12 +29,12 @@ from mjx_dher.relabel import add_pool, draw_batches, relabel
 from mjx_dher.replay import ReplayState
 from mjx_dher.rollout import rollout
 from mjx_dher.samplers import LogWeightsFn, Sampler
-from mjx_dher.types import Array, Env, EnvSpec, Episode, GoalObs, Metrics, PRNGKey, PyTree
+from mjx_dher.types import Array, Batch, Env, EnvSpec, Episode, GoalObs, Metrics, PRNGKey, PyTree
 
 # Most transitions per draw, but at least one target period. Larger draws do not fit into a CPU's cache.
 MAX_TRANSITIONS_PER_DRAW = 16_384
 # Folded into a cycle's key for goals, renewed rows and added episodes; no indices of `jax.random.split`.
-GENERATE, RENEW, ADD = 0x476F616C, 0x52656E65, 0x44656D6F
+GENERATE, RENEW, ADD, AUGMENT = 0x476F616C, 0x52656E65, 0x44656D6F, 0x41756767
 
 
 # generator(key, obs with leading [N], ring, context) -> goals [N, G] to play for; `contrib.generators.Generator` is one
@@ -79,6 +79,7 @@ class Loop:
     learner: Learner
     template: Episode  # shapes and dtypes of an episode
     axis_name: AxisName
+    augment: Callable[..., Batch] | None  # (batch, key=key) -> batch
 
     @property
     def num_episodes(self) -> int:
@@ -147,6 +148,7 @@ def make_train(
         learner=learner if axis_name is None else learners.over_axis(learner, axis_name),
         template=template,
         axis_name=axis_name,
+        augment=_augment(config, env),
     )
     if problem := validation.delay_problem(config, learners.policy_delay(loop.learner)):
         raise ValueError(problem)
@@ -158,6 +160,14 @@ def make_train(
     init, epoch, add = functools.partial(_init, loop), functools.partial(_epoch, loop), functools.partial(_add_episodes, loop)
     nbytes = replay.nbytes(loop.template, loop.num_episodes)
     return Train(init, epoch, add, functools.partial(_evaluate, loop), spec, loop.learner, nbytes, axis_name)
+
+
+def _augment(config: Config, env: Env) -> Callable[..., Batch] | None:
+    if config.augmentation == "none":
+        return None
+    from mjx_dher import mirror  # few runs need it
+
+    return functools.partial(mirror.half, mirror=mirror.of_env(env))
 
 
 def _init(loop: Loop, key: PRNGKey, hparams: HParams) -> TrainState:
@@ -306,6 +316,8 @@ def _learn(loop: Loop, learner: PyTree, ring: ReplayState, context: Context, key
 
     def draw_and_update(learner: PyTree, key: PRNGKey) -> tuple[PyTree, Metrics]:
         batches = draw_batches(ring, key, shape, loop.sampler, context, weights, config.n_step, loop.priority)
+        if loop.augment is not None:
+            batches = loop.augment(batches, key=jax.random.fold_in(key, AUGMENT))
         return jax.lax.scan(update, learner, batches)
 
     keys = jax.random.split(key, config.updates_per_cycle // (loop.updates_per_round * loop.rounds_per_draw))

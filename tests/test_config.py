@@ -166,7 +166,13 @@ def test_every_number_has_a_range_and_a_default_in_it():
     numbers = config.metadata(HParams, Number)
     assert set(numbers) == set(HParams._fields)
     assert all(number.contains(getattr(HParams(), name)) for name, number in numbers.items())
-    sizes = set(config.metadata(Config, Number)) | {"learner_dtype", "energy", "contrastive_loss", "same_episode"}
+    sizes = set(config.metadata(Config, Number)) | {
+        "learner_dtype",
+        "energy",
+        "contrastive_loss",
+        "same_episode",
+        "augmentation",
+    }
     assert sizes == {field.name for field in dataclasses.fields(Config)}
 
 

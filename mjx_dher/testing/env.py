@@ -36,6 +36,7 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
     - If all rewards are at an end of the range, success is never 1 at the low end, and not always 0 at the high end. They need
       not agree at each step, because an environment may require more for a success, such as rest.
     - An episode has at least one step. States after its end (`EnvSpec.ends`) and states with `failed` are ignored.
+    - `mirror`, if present, keeps shapes, types and the rewards of goals. A mirror image of a mirror image is the original.
     - `with_goal`, if present, sets another desired goal, which the state keeps, and changes nothing else. A step to a state
       that reaches it differs only in reward and success: `terminal` holds for every goal, and observations do not have it.
 
@@ -55,6 +56,7 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
     states = jax.device_get(_play(env, keys, actions))  # [T+1, N, ...]
     played = _outputs(states)
     valid = _check_episodes(env, spec, played)
+    _check_mirror(env, states.obs, actions, tolerance)
     _check_alone(env, keys, jax.device_get(actions), states, tolerance)
     _check_rewards(env, spec, played, valid, tolerance)
     contract.check_steps(env)
@@ -186,6 +188,24 @@ def _check_goal_is_apart(step: Callable[[Any], dict[str, Any]], state: Any, goal
     for name in (name for name in own if name.startswith("observation")):
         same = np.allclose(own[name], changed[name], rtol=tolerance, atol=tolerance, equal_nan=True)
         expect(same, f"{name} must not depend on the desired goal, because relabelling replaces the goal alone; it does")
+
+
+def _check_mirror(env: Any, obs: Any, actions: jax.Array, tolerance: float) -> None:
+    """Checks mirror images of all states but the last. `obs` leads with [T+1, N] and `actions` with [T, N]."""
+    if not callable(getattr(env, "mirror", None)):
+        return
+    observation, achieved, desired = (jax.tree.map(lambda x: x[:-1], obs[name]) for name in ("observation", *GOALS))
+
+    def mirror(goal: Any) -> tuple[Any, Any]:
+        image = env.mirror(observation, goal, actions)
+        check.kept("mirror", (observation, goal, actions), image)
+        return image, env.mirror(*image)
+
+    image, again = run("mirror", mirror, desired)
+    expect_same("mirror of a mirror image", again, (observation, desired, actions), tolerance)
+    other, _ = run("mirror", mirror, achieved)
+    rewards = [run("compute_reward", env.compute_reward, *pair) for pair in ((achieved, desired), (other[1], image[1]))]
+    expect_same("compute_reward of mirrored goals", rewards[1], rewards[0], tolerance)
 
 
 def _check_rewards(env: Any, spec: EnvSpec, played: dict[str, NDArray], valid: NDArray, tolerance: float) -> None:

@@ -1,0 +1,152 @@
+"""Mirror images: of transitions in a batch, and of the Fetch tasks, whose physics follows them."""
+
+import dataclasses
+
+import configs
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import refuses
+
+from mjx_dher import HParams, envs, make_train
+from mjx_dher.envs.wrappers import FrameStack
+from mjx_dher.mirror import half
+from mjx_dher.testing import check_env
+from mjx_dher.types import Batch
+from point_mass import PointMass
+from probes import Least
+
+MIRRORED = dataclasses.replace(configs.TINY, augmentation="mirror", updates_per_cycle=250, batch_size=80)
+
+
+class Plane(PointMass):
+    """A point that starts right of the axis x = 0, in whose mirror image left and right are exchanged."""
+
+    def reset(self, key):
+        return self._state(*jax.random.uniform(key, (2, 2), minval=2.0, maxval=3.0))
+
+    def mirror(self, observation, goal, action):
+        across = jnp.array([-1.0, 1.0])
+        return observation * across, goal * across, action * across
+
+
+class Turned(Plane):
+    def mirror(self, observation, goal, action):
+        observation, goal, action = super().mirror(observation, goal, action)
+        return observation[..., ::-1], goal, action
+
+
+class Sheared(Plane):
+    """(x, y) becomes (x, x - y): twice is nothing, but distances change."""
+
+    def mirror(self, observation, goal, action):
+        return observation, goal @ jnp.array([[1.0, 1.0], [0.0, -1.0]]), action
+
+
+class Shorter(Plane):
+    def mirror(self, observation, goal, action):
+        return observation, goal[..., :1], action
+
+
+def transitions(number):
+    """Transitions that differ from their images in all parts, with two leading axes."""
+    keys = jax.random.split(jax.random.key(0), 5)
+    parts = [jax.random.uniform(key, (2, number // 2, 2), minval=0.1, maxval=1.0) for key in keys]
+    reward = jnp.arange(float(number)).reshape(2, -1)
+    names = ("observation", "next_observation", "desired_goal", "action", "hindsight_goal")
+    return Batch(**dict(zip(names, parts)), reward=reward, discount=-reward, row=reward.astype(jnp.int32))
+
+
+def test_half_of_a_batch_is_mirrored_whole():
+    batch = transitions(2000)
+    result = half(batch, Plane().mirror, jax.random.key(1))
+    for name in ("reward", "discount", "row"):
+        np.testing.assert_array_equal(getattr(result, name), getattr(batch, name))
+    side = np.sign(result.observation[..., 0])
+    assert 900 < (side < 0).sum() < 1100  # 4.5 standard deviations
+    for name in ("observation", "next_observation", "desired_goal", "action", "hindsight_goal"):
+        expected = getattr(batch, name) * np.stack([side, np.ones_like(side)], axis=-1)
+        np.testing.assert_array_equal(getattr(result, name), expected)
+    by_hand = half(dataclasses.replace(batch, hindsight_goal=None), Plane().mirror, jax.random.key(1))
+    assert by_hand.hindsight_goal is None
+    np.testing.assert_array_equal(by_hand.desired_goal, result.desired_goal)
+
+
+class Sides(Least):
+    """Learns the share of transitions to the left of the axis."""
+
+    def update(self, state, batch, hparams):
+        left = jnp.mean(batch.observation[..., 0] < 0)
+        return {"w": state["w"] + left / MIRRORED.updates_per_cycle}, {"q_mean": left}
+
+
+@pytest.mark.parametrize(("augmentation", "share"), [("mirror", 0.5), ("none", 0.0)])
+def test_the_learner_gets_mirror_images_and_the_ring_does_not(augmentation, share):
+    train = make_train(Plane(), dataclasses.replace(MIRRORED, augmentation=augmentation), learner=Sides())
+    state, _ = jax.jit(train.epoch)(train.init(jax.random.key(0), HParams()))
+    np.testing.assert_allclose(state.learner["w"], share, atol=0.02)  # of 20,000 transitions
+    assert state.replay.episodes.observation[..., 0].min() >= 0  # empty rows are 0
+
+
+def test_a_task_without_mirror_is_refused():
+    with refuses("augmentation", "mirror"):
+        make_train(PointMass(), MIRRORED)
+
+
+def test_a_mirror_that_is_none_is_named_by_the_check():
+    check_env(Plane())
+    for wrong, problem in (
+        (Turned, "mirror of a mirror"),
+        (Sheared, "compute_reward of mirrored goals"),
+        (Shorter, "mirror must keep"),
+    ):
+        with pytest.raises(ValueError, match=problem):
+            check_env(wrong())
+    with pytest.raises(ValueError, match="mirror must keep"):
+        half(transitions(4), Shorter().mirror, jax.random.key(0))
+
+
+def test_each_frame_of_a_stack_is_mirrored():
+    env = FrameStack(Plane(), 2)
+    observation, goal, action = env.mirror(jnp.arange(4.0), jnp.ones(2), jnp.ones(2))
+    np.testing.assert_array_equal(observation, [0.0, 1.0, -2.0, 3.0])
+    np.testing.assert_array_equal([goal, action], [[-1.0, 1.0]] * 2)
+    assert not hasattr(FrameStack(PointMass(), 2), "mirror")
+    check_env(env)
+
+
+def test_the_image_of_a_fetch_observation():
+    """By hand, for Push: y is mirrored at y0, and a rotation about x or z turns the other way."""
+    env = envs.make("push")
+    y0 = env.task.initial_grip_pos[1]
+    seen, goal, action = env.mirror(
+        jnp.array([1.3, y0 + 0.1, 0.5, 1.2, y0, 0.4, -0.1, -0.1, -0.1, 0.01, 0.02, *range(1, 13), 0.3, 0.4]),
+        jnp.array([1.2, y0 - 0.2, 0.4]),
+        jnp.array([0.1, 0.2, 0.3, 0.4]),
+    )
+    turned = [-1, 2, -3, 4, -5, 6, -7, 8, -9, 10, -11, 12]
+    expected = [1.3, y0 - 0.1, 0.5, 1.2, y0, 0.4, -0.1, 0.1, -0.1, 0.02, 0.01, *turned, 0.4, 0.3]
+    np.testing.assert_allclose(seen, expected, atol=1e-6)
+    np.testing.assert_allclose(goal, [1.2, y0 + 0.2, 0.4], atol=1e-6)
+    np.testing.assert_allclose(action, [0.1, -0.2, 0.3, 0.4], atol=1e-6)
+
+
+@pytest.mark.parametrize("task", ["reach", pytest.param("pick_and_place", marks=pytest.mark.slow), "slide"])
+def test_fetch_moves_in_a_mirror_as_its_image(task):
+    """Two episodes, one with the mirrored start and actions: after half a second they are mirror images within millimetres."""
+    env = envs.make(task, engine="native")
+    first = env.reset(jax.random.key(0))
+    actions = jax.random.uniform(jax.random.key(1), (12, 4), minval=-1.0, maxval=1.0)
+    ends = []
+    for mirrored in (False, True):
+        observation, goal, played = first.obs["observation"], first.obs["desired_goal"], actions
+        if mirrored:
+            observation, goal, played = env.mirror(observation, goal, actions)
+        start = jnp.array([*observation[3:6], 1.0, 0.0, 0.0, 0.0]) if env.has_object else None
+        states, _ = jax.lax.scan(lambda s, a: (env.step(s, a), None), env.init_state(start, goal), played)
+        ends.append((states.obs["observation"], states.obs["desired_goal"], actions))
+    one, other = ends
+    assert np.linalg.norm(one[0][:3] - first.obs["observation"][:3]) > 0.05
+    assert abs(one[0][1] - other[0][1]) > 0.02
+    np.testing.assert_allclose(env.mirror(*one)[0], other[0], atol=2e-3)
