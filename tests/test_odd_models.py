@@ -134,7 +134,7 @@ def test_a_default_configuration_outside_joints_ranges_is_rejected():
     make(model, start=task.Start(ranges={"j": (-2, -1.5), "k": (0.5, 0.5)}))
 
 
-@pytest.mark.parametrize("turn", [0.0, 0.2])
+@pytest.mark.parametrize("turn", [pytest.param(0.0, marks=pytest.mark.slow), 0.2])
 @pytest.mark.parametrize(
     "weld",
     [

@@ -86,7 +86,7 @@ def test_samplers_draw_the_same_goals_with_64_bits(sampler):
     assert_the_same_both_ways(draw)
 
 
-@pytest.mark.parametrize("priority", ["dpp", "curriculum", "not_misleading"])
+@pytest.mark.parametrize("priority", [pytest.param("dpp", marks=pytest.mark.slow), "curriculum", "not_misleading"])
 def test_priorities_choose_the_same_transitions_with_64_bits(priority):
     def draw():
         ring, chosen = ring_of(ends=False), whole(make(priority))

@@ -95,7 +95,10 @@ def test_replay_drawn_from_without_rows():
     jax.eval_shape(lambda ring, key: replay.sample(ring, key, 5), ring, jax.random.key(0))
 
 
-@pytest.mark.parametrize("name", ["pick_and_place", "push", "reach", "slide", "block", "pen_rotate", "hand_reach"])
+@pytest.mark.parametrize(
+    "name",
+    ["pick_and_place", "push", "reach", "slide", "block", "pen_rotate", pytest.param("hand_reach", marks=pytest.mark.slow)],
+)
 def test_the_tasks(name):
     env = envs.make(name, engine="native")
     states = jax.eval_shape(jax.vmap(env.reset), jax.random.split(jax.random.key(0), 2))

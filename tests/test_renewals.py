@@ -111,7 +111,7 @@ def test_a_priority_that_compares_episodes_is_handed_all_of_them():
     assert not contributed.max_entropy.by_part
 
 
-@pytest.mark.parametrize("renewals", [0, 1, 2, 10**6])
+@pytest.mark.parametrize("renewals", [0, pytest.param(1, marks=pytest.mark.slow), 2, 10**6])
 def test_a_run_renews_its_own_episodes_and_as_many_others_as_it_is_told(renewals):
     cycle, number = renewed_at(renewals, BY_CYCLE), SMALL.num_envs
     if renewals in (0, 10**6):  # all of the ring, at the last cycle
