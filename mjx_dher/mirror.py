@@ -27,11 +27,18 @@ def half(batch: Batch, mirror: MirrorFn, key: PRNGKey) -> Batch:
       mirror: the environment's method (`types.Env`).
 
     Raises:
-      ValueError: `mirror` changes a shape or a type.
+      ValueError: `mirror` changes a shape or a type, or does not return three parts.
     """
+
+    def seen(observation: Any, goal: Array) -> tuple[Any, Array, Array]:
+        given = observation, goal, batch.action
+        image = mirror(*given)
+        check.kept("mirror", given, image)
+        return image
+
     hindsight = batch.hindsight_goal
-    observation, goal, action = mirror(batch.observation, batch.desired_goal, batch.action)
-    following, other, _ = mirror(batch.next_observation, batch.desired_goal if hindsight is None else hindsight, batch.action)
+    observation, goal, action = seen(batch.observation, batch.desired_goal)
+    following, other, _ = seen(batch.next_observation, batch.desired_goal if hindsight is None else hindsight)
     image = dataclasses.replace(
         batch,
         observation=observation,
@@ -40,7 +47,6 @@ def half(batch: Batch, mirror: MirrorFn, key: PRNGKey) -> Batch:
         action=action,
         hindsight_goal=None if hindsight is None else other,
     )
-    check.kept("mirror", batch, image)
     coin = jax.random.bernoulli(key, shape=batch.reward.shape)
 
     def keep(own: Array, mirrored: Array) -> Array:

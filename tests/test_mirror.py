@@ -103,8 +103,9 @@ def test_a_mirror_that_is_none_is_named_by_the_check():
     ):
         with pytest.raises(ValueError, match=problem):
             check_env(wrong())
-    with pytest.raises(ValueError, match="mirror must keep"):
-        half(transitions(4), Shorter().mirror, jax.random.key(0))
+    for wrong in (Shorter().mirror, lambda observation, goal, action: (observation, goal)):
+        with pytest.raises(ValueError, match="mirror must keep"):
+            half(transitions(4), wrong, jax.random.key(0))
 
 
 def test_each_frame_of_a_stack_is_mirrored():
