@@ -237,6 +237,22 @@ def test_the_candidate_of_slide_passed():
     assert "{} below the median, the former preset's {}.".format(*falls) in page
 
 
+def test_what_mirror_images_gain():
+    """Of both tables of their trials: means, and Student's intervals of the paired differences."""
+    page = (ROOT / "docs" / "experiments" / "preset_mirror.md").read_text()
+    for line in re.findall(r"\| (?:the preset|with mirror images) (\|.*\|)\n", page)[:2]:
+        *successes, mean = map(float, line.strip("| ").split(" | "))
+        np.testing.assert_allclose(np.mean(successes), mean, atol=0.005)  # of rounded numbers
+    rows = re.findall(r"\| 61\d \| (.*) \| (.*) \|", page)
+    assert len(rows) == 5
+    before, after = (np.array([[float(n.replace(",", "")) for n in row[i].split(", ")] for row in rows]) for i in (0, 1))
+    shown = re.search(r"\| difference \| \| (.*) \|", page).group(1)
+    numbers = [float(n.replace(",", "")) for n in re.findall(r"[-+][\d.]+(?:,\d{3})?", shown)]
+    for column, (mean, low, high), allowed in zip((after - before).T, np.reshape(numbers, (3, 3)), (500, 0.001, 0.0005)):
+        interval = scipy.stats.t.interval(0.95, 4, column.mean(), scipy.stats.sem(column))
+        np.testing.assert_allclose([column.mean(), *interval], [mean, low, high], atol=allowed)
+
+
 def test_what_hindsight_gains():
     """Of the table of runs with and without hindsight: means, and Student's interval of the paired difference."""
     section = (ROOT / "docs" / "experiments" / "preset_gpu.md").read_text().split("## Without hindsight")[1].split("\n## ")[0]
