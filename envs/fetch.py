@@ -5,6 +5,7 @@ were measured there after the environment's set-up (docs/fidelity.md).
 """
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -18,7 +19,7 @@ from mjx_dher.envs.arm_kinematics import Chain, integrate, matrix_to_euler, quat
 from mjx_dher.envs.base import State
 from mjx_dher.envs.engines import Controls, Physics, check_shape
 from mjx_dher.envs.simulated import Range, SimulatedTask
-from mjx_dher.types import Array, EnvSpec, PRNGKey
+from mjx_dher.types import Array, EnvSpec, MirrorFn, PRNGKey
 
 SUBSTEPS = 20  # physics steps of 2 ms per action: 25 actions a second
 # Above either speed the simulation has diverged.
@@ -37,7 +38,6 @@ _WITH_OBJECT = {
     **{"object_vel - grip_vel": 3, "object_angvel": 3, "grip_vel": 3, "finger_vel": 2},
 }
 _WITHOUT_OBJECT = {name: _WITH_OBJECT[name] for name in ("grip_pos", "finger_pos", "grip_vel", "finger_vel")}
-_POSITIONS, _ROTATIONS = ("grip_pos", "object_pos"), ("object_euler", "object_angvel")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,21 +115,16 @@ class FetchEnv(SimulatedTask):
         """Lowest and highest coordinates [2, 3] of goals in m."""
         return self.task.goal_bounds.astype(np.float32)
 
-    def mirror(self, observation: Array, goal: Array, action: Array) -> tuple[Array, Array, Array]:
-        """Observation [..., D], goal [..., 3] and action [..., 4], mirrored at the vertical plane along x through the start of
-        the gripper. The arm's base lies beside it, so the robot follows its mirror image only nearly (docs/samplers.md).
+    @property
+    def mirror(self) -> MirrorFn:
+        """Mirror image at the vertical plane along x through the start of the gripper (docs/samplers.md). Raises AttributeError
+        if a subclass has own methods that may contradict it: it then needs its own `mirror`.
         """
-        across = np.array([1.0, -1.0, 1.0], np.float32)
-        shift = np.array([0.0, 2.0 * self.task.initial_grip_pos[1], 0.0], np.float32)
+        if self._own:
+            raise AttributeError(f"mirror: own {', '.join(self._own)} may contradict it")
+        from mjx_dher import mirror  # few runs need it
 
-        def image(name: str, entry: Array) -> Array:
-            if entry.shape[-1] == 2:  # the fingers change places
-                return entry[..., ::-1]
-            return entry * (-across if name in _ROTATIONS else across) + (shift if name in _POSITIONS else 0.0)
-
-        parts = jnp.split(observation, np.cumsum([*self._entries.values()])[:-1], axis=-1)
-        seen = jnp.concatenate([image(*part) for part in zip(self._entries, parts)], axis=-1)
-        return seen, goal * across + shift, action * np.append(across, np.float32(1.0))
+        return functools.partial(mirror.across_y, self._entries, self.task.initial_grip_pos[1])
 
     def describe(self) -> dict[str, Any]:
         ends = np.cumsum([0, *self._entries.values()]).tolist()

@@ -1,10 +1,12 @@
 """Mirror images of transitions (Lin et al. 2020, "Invariant Transform Experience Replay", arXiv 1909.10707)."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from mjx_dher import check
 from mjx_dher.types import Array, Batch, MirrorFn, PRNGKey
@@ -53,3 +55,30 @@ def half(batch: Batch, mirror: MirrorFn, key: PRNGKey) -> Batch:
         return jnp.where(coin.reshape(*coin.shape, *[1] * (own.ndim - coin.ndim)), mirrored, own)
 
     return jax.tree.map(keep, batch, image)
+
+
+def across_y(
+    entries: Mapping[str, int], middle: float, observation: Array, goal: Array, action: Array
+) -> tuple[Array, Array, Array]:
+    """Mirror image, at the plane y = `middle` in m, of a scene with one gripper that moves along the axes.
+
+    Args:
+      entries: names of the observation's entries and their sizes. Three numbers are a position ("..._pos"), a rotation
+        ("..._euler" or "..._angvel"), or else a difference or a velocity. Two are the fingers, which change places.
+      observation: [..., D].
+      goal: position [..., 3].
+      action: displacement and fingers [..., 4].
+    """
+    across = np.array([1.0, -1.0, 1.0], np.float32)
+    shift = np.array([0.0, 2.0 * middle, 0.0], np.float32)
+
+    def image(name: str, entry: Array) -> Array:
+        if entry.shape[-1] == 2:
+            return entry[..., ::-1]
+        turned = name.endswith(("_euler", "_angvel"))
+        placed = name.endswith("_pos") and " - " not in name
+        return entry * (-across if turned else across) + (shift if placed else 0.0)
+
+    parts = jnp.split(observation, np.cumsum([*entries.values()])[:-1], axis=-1)
+    seen = jnp.concatenate([image(*part) for part in zip(entries, parts)], axis=-1)
+    return seen, goal * across + shift, action * np.append(across, np.float32(1.0))

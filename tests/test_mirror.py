@@ -10,6 +10,7 @@ import pytest
 from conftest import refuses
 
 from mjx_dher import HParams, envs, make_train
+from mjx_dher.envs.fetch import Push
 from mjx_dher.envs.wrappers import FrameStack
 from mjx_dher.mirror import half
 from mjx_dher.testing import check_env
@@ -131,6 +132,24 @@ def test_the_image_of_a_fetch_observation():
     np.testing.assert_allclose(seen, expected, atol=1e-6)
     np.testing.assert_allclose(goal, [1.2, y0 + 0.2, 0.4], atol=1e-6)
     np.testing.assert_allclose(action, [0.1, -0.2, 0.3, 0.4], atol=1e-6)
+
+
+class Seen(Push):
+    def observe(self, physics):
+        return super().observe(physics) ** 2
+
+
+class Both(Seen):
+    def mirror(self, observation, goal, action):
+        return observation, goal, action
+
+
+def test_an_own_observation_needs_an_own_mirror():
+    """The inherited one would be wrong without an error, because the sizes agree."""
+    assert not hasattr(Seen("native"), "mirror")
+    with refuses("augmentation", "mirror"):
+        make_train(Seen("native"), dataclasses.replace(MIRRORED, replay_size=1000))
+    make_train(Both("native"), dataclasses.replace(MIRRORED, replay_size=1000))
 
 
 @pytest.mark.parametrize("task", ["reach", pytest.param("pick_and_place", marks=pytest.mark.slow), "slide"])
