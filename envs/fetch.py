@@ -6,6 +6,7 @@ were measured there after the environment's set-up (docs/fidelity.md).
 
 import dataclasses
 import functools
+import inspect
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -118,10 +119,11 @@ class FetchEnv(SimulatedTask):
     @property
     def mirror(self) -> MirrorFn:
         """Mirror image at the vertical plane along x through the start of the gripper (docs/samplers.md). Raises AttributeError
-        if a subclass has own methods that may contradict it: it then needs its own `mirror`.
+        if a subclass or mixin replaces a method, which may contradict it: it then needs its own `mirror`.
         """
-        if self._own:
-            raise AttributeError(f"mirror: own {', '.join(self._own)} may contradict it")
+        names = [name for name in dir(FetchEnv) if inspect.isfunction(getattr(FetchEnv, name)) and name != "__init__"]
+        if own := [name for name in names if getattr(type(self), name) is not getattr(FetchEnv, name)]:
+            raise AttributeError(f"the inherited mirror may contradict its own {', '.join(own)}")
         from mjx_dher import mirror  # few runs need it
 
         return functools.partial(mirror.across_y, self._entries, self.task.initial_grip_pos[1])

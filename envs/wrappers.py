@@ -39,6 +39,8 @@ class WrapperState:
 class Wrapper:
     """Base class: passes actions and observations on unchanged. Goals, rewards and success come from the inner environment."""
 
+    keeps_mirror = False  # whether the inner environment's `mirror` holds for the wrapper's observations and actions
+
     def __init__(self, env: Any):
         check_env_parts(env)
         self.env = env
@@ -50,6 +52,8 @@ class Wrapper:
             raise AttributeError(name)
         if name in ("init_state", "first_state"):  # they have no key for the wrapper's memory
             raise AttributeError(f"a wrapped environment has no {name}: use reset(key)")
+        if name == "mirror" and not self.keeps_mirror:
+            raise AttributeError(f"the mirror of {type(self.env).__name__} may contradict {type(self).__name__}")
         own = getattr(self.env, name)  # with_goal and with_object only if the environment has them
         return {"with_goal": self._with_goal, "with_object": self._with_object}.get(name, own)
 
@@ -116,6 +120,8 @@ class ObservationNoise(Wrapper):
       obs_noise: standard deviation in [0, 1000], a number, or [D] for a vector observation.
     """
 
+    keeps_mirror = True
+
     def __init__(self, env: Any, obs_noise: Any):
         super().__init__(env)
         for value in np.ravel(obs_noise).tolist():
@@ -146,6 +152,8 @@ class ActionDelay(Wrapper):
       action_delay: steps, at most 1000, or (low, high) or "low-high" to draw a number at each reset.
     """
 
+    keeps_mirror = True
+
     def __init__(self, env: Any, action_delay: int | tuple[int, int] | str):
         super().__init__(env)
         between = re.fullmatch(r"(\d{1,4})-(\d{1,4})", action_delay) if isinstance(action_delay, str) else None
@@ -170,6 +178,8 @@ class ActionFilter(Wrapper):
     Args:
       action_filter: c in [0, 1). 0 filters nothing.
     """
+
+    keeps_mirror = True
 
     def __init__(self, env: Any, action_filter: float):
         super().__init__(env)
@@ -209,9 +219,10 @@ class FrameStack(Wrapper):
         inner = self.env.mirror
 
         def of_frames(observation: PyTree, goal: Array, action: Array) -> tuple[PyTree, Array, Array]:
-            split = jax.tree.map(lambda x: jnp.stack(jnp.split(x, self._frames, axis=-1)), observation)
-            frames = [inner(jax.tree.map(lambda x: x[i], split), goal, action) for i in range(self._frames)]  # noqa: B023
-            return self._join(tuple(frame[0] for frame in frames)), *frames[0][1:]
+            leaves, structure = jax.tree.flatten(observation)
+            frames = zip(*(jnp.split(leaf, self._frames, axis=-1) for leaf in leaves))
+            images = [inner(jax.tree.unflatten(structure, frame), goal, action) for frame in frames]
+            return self._join(tuple(image[0] for image in images)), *images[0][1:]
 
         return of_frames
 

@@ -88,7 +88,7 @@ class Config:
     """Priorities renewed per cycle and new episode: the new episodes first, then random ones. 0 renews the whole ring. Read by
     renewable priorities that weigh each episode alone: of the built-in ones, td_error."""
     augmentation: Literal["none", "mirror"] = "none"
-    """mirror replaces a random half of each batch by mirror images (ITER). The task needs the method mirror."""
+    """mirror replaces a random half of each batch by mirror images. The task needs the method mirror."""
     eval_episodes: Count = 100
     """Episodes of the deterministic evaluation after each epoch."""
 

@@ -14,9 +14,10 @@ from mjx_dher.types import Array, Batch, MirrorFn, PRNGKey
 
 def of_env(env: Any) -> MirrorFn:
     """The method `mirror` of an environment. Raises ValueError if it has none."""
-    if not callable(mirror := getattr(env, "mirror", None)):
-        raise ValueError(f"augmentation mirror needs an environment with mirror(observation, goal, action); {env!r} has none")
-    return cast("MirrorFn", mirror)
+    try:
+        return cast("MirrorFn", env.mirror)
+    except AttributeError as error:
+        raise ValueError(f"augmentation mirror needs an environment with mirror(observation, goal, action): {error}") from error
 
 
 def half(batch: Batch, mirror: MirrorFn, key: PRNGKey) -> Batch:
@@ -68,7 +69,12 @@ def across_y(
       observation: [..., D].
       goal: position [..., 3].
       action: displacement and fingers [..., 4].
+
+    Raises:
+      ValueError: the observation has another size.
     """
+    if observation.shape[-1] != sum(entries.values()):
+        raise ValueError(f"mirror: the observation must be [..., {sum(entries.values())}]; got {list(observation.shape)}")
     across = np.array([1.0, -1.0, 1.0], np.float32)
     shift = np.array([0.0, 2.0 * middle, 0.0], np.float32)
 

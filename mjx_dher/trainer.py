@@ -34,7 +34,8 @@ from mjx_dher.types import Array, Batch, Env, EnvSpec, Episode, GoalObs, Metrics
 # Most transitions per draw, but at least one target period. Larger draws do not fit into a CPU's cache.
 MAX_TRANSITIONS_PER_DRAW = 16_384
 # Folded into a cycle's key for goals, renewed rows and added episodes; no indices of `jax.random.split`.
-GENERATE, RENEW, ADD, AUGMENT = 0x476F616C, 0x52656E65, 0x44656D6F, 0x41756767
+GENERATE, RENEW, ADD = 0x476F616C, 0x52656E65, 0x44656D6F
+_AUGMENT = 0x41756767  # folded into the key of a draw
 
 
 # generator(key, obs with leading [N], ring, context) -> goals [N, G] to play for; `contrib.generators.Generator` is one
@@ -317,7 +318,7 @@ def _learn(loop: Loop, learner: PyTree, ring: ReplayState, context: Context, key
     def draw_and_update(learner: PyTree, key: PRNGKey) -> tuple[PyTree, Metrics]:
         batches = draw_batches(ring, key, shape, loop.sampler, context, weights, config.n_step, loop.priority)
         if loop.augment is not None:
-            batches = loop.augment(batches, key=jax.random.fold_in(key, AUGMENT))
+            batches = loop.augment(batches, key=jax.random.fold_in(key, _AUGMENT))
         return jax.lax.scan(update, learner, batches)
 
     keys = jax.random.split(key, config.updates_per_cycle // (loop.updates_per_round * loop.rounds_per_draw))

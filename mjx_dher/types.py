@@ -174,8 +174,7 @@ class Env(Protocol):
       dt: seconds per step, for videos, the viewer, Gymnasium and `energy`. Default: 0.04.
       rest_action: action [A] that holds the start pose; action delays and filters begin with it. Default: 0.
       with_goal(state, goal): initial state with another desired goal [G]. Goal generators need it.
-      mirror(observation, goal, action): the three [..., D], [..., G] and [..., A] in a mirror image of the scene. Twice it
-        changes nothing, and it keeps the rewards of goals. `Config.augmentation` "mirror" needs it.
+      mirror(observation, goal, action): the three in a mirror image, which keeps rewards. `Config.augmentation` needs it.
       check(): called on the host after each epoch. Raises ValueError if steps were silently wrong.
     """
 

@@ -10,8 +10,8 @@ import pytest
 from conftest import refuses
 
 from mjx_dher import HParams, envs, make_train
-from mjx_dher.envs.fetch import Push
-from mjx_dher.envs.wrappers import FrameStack
+from mjx_dher.envs.fetch import Push, fetch_observation
+from mjx_dher.envs.wrappers import ActionDelay, FrameStack, ObservationNoise, Wrapper
 from mjx_dher.mirror import half
 from mjx_dher.testing import check_env
 from mjx_dher.types import Batch
@@ -138,18 +138,56 @@ class Seen(Push):
     def observe(self, physics):
         return super().observe(physics) ** 2
 
+    def describe(self):
+        return {}
+
+
+class Rewarded(Push):
+    def compute_reward(self, achieved_goal, desired_goal):
+        return -(achieved_goal[..., 1] < desired_goal[..., 1]).astype(jnp.float32)
+
 
 class Both(Seen):
     def mirror(self, observation, goal, action):
         return observation, goal, action
 
 
-def test_an_own_observation_needs_an_own_mirror():
-    """The inherited one would be wrong without an error, because the sizes agree."""
-    assert not hasattr(Seen("native"), "mirror")
-    with refuses("augmentation", "mirror"):
-        make_train(Seen("native"), dataclasses.replace(MIRRORED, replay_size=1000))
-    make_train(Both("native"), dataclasses.replace(MIRRORED, replay_size=1000))
+class Seventh(Wrapper):
+    def see(self, memory, observation):
+        return memory, observation[..., ::-1]
+
+
+def test_an_inherited_mirror_that_may_be_wrong_is_refused():
+    """It would be wrong without an error where the sizes agree."""
+    config = dataclasses.replace(MIRRORED, replay_size=1000)
+    for env, reason in (
+        (Seen("native"), "own describe, observe"),
+        (Rewarded("native"), "own compute_reward"),
+        (Seventh(Plane()), "mirror of Plane may contradict Seventh"),
+    ):
+        assert not hasattr(env, "mirror")
+        with pytest.raises(ValueError, match=f"augmentation mirror needs .*{reason}"):
+            make_train(env, config)
+    make_train(Both("native"), config)
+    assert hasattr(ActionDelay(ObservationNoise(Plane(), 0.1), 2), "mirror")
+    with refuses("mirror", "observation"):
+        envs.make("push").mirror(jnp.ones(26), jnp.ones(3), jnp.ones(4))
+
+
+def test_the_image_of_an_observation_is_the_observation_of_the_image():
+    """The observation of a mirrored object and gripper, computed from their positions, is the mirrored observation."""
+    env, rng = envs.make("push"), np.random.default_rng(0)
+    across, turned = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])
+    place = lambda x: x * across + [0.0, 2 * env.task.initial_grip_pos[1], 0.0]  # noqa: E731
+    for _ in range(5):
+        grip, grip_vel, pos, vel, spin, goal = rng.normal(size=(6, 3))
+        quat, fingers = rng.normal(size=4), rng.normal(size=(2, 2))
+        quat /= np.linalg.norm(quat)
+        image = quat * [1.0, -1.0, 1.0, -1.0]
+        of = fetch_observation(grip, grip_vel, np.array([*pos, *quat]), np.array([*vel, *spin]), *fingers)
+        moved = np.array([*vel * across, *spin * turned])  # the spin is given in the object's axes
+        expected = fetch_observation(place(grip), grip_vel * across, np.array([*place(pos), *image]), moved, *fingers[:, ::-1])
+        np.testing.assert_allclose(env.mirror(of, goal, np.ones(4))[0], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("task", ["reach", pytest.param("pick_and_place", marks=pytest.mark.slow), "slide"])

@@ -95,7 +95,6 @@ WELDED = """
 """
 
 
-@pytest.mark.slow
 def test_mjx_still_drops_the_velocity_term_of_a_weld():
     model = mujoco.MjModel.from_xml_string(WELDED)
     data = mujoco.MjData(model)

@@ -37,6 +37,7 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
       not agree at each step, because an environment may require more for a success, such as rest.
     - An episode has at least one step. States after its end (`EnvSpec.ends`) and states with `failed` are ignored.
     - `mirror`, if present, keeps shapes, types and the rewards of goals. A mirror image of a mirror image is the original.
+      Whether the physics follows its image is not tested.
     - `with_goal`, if present, sets another desired goal, which the state keeps, and changes nothing else. A step to a state
       that reaches it differs only in reward and success: `terminal` holds for every goal, and observations do not have it.
 
@@ -56,8 +57,9 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
     states = jax.device_get(_play(env, keys, actions))  # [T+1, N, ...]
     played = _outputs(states)
     valid = _check_episodes(env, spec, played)
-    _check_mirror(env, states.obs, actions, tolerance)
-    _check_alone(env, keys, jax.device_get(actions), states, tolerance)
+    actions = jax.device_get(actions)
+    _check_mirror(env, jax.tree.map(lambda x: x[:-1], states.obs), actions, valid[:-1], tolerance)
+    _check_alone(env, keys, actions, states, tolerance)
     _check_rewards(env, spec, played, valid, tolerance)
     contract.check_steps(env)
 
@@ -190,11 +192,12 @@ def _check_goal_is_apart(step: Callable[[Any], dict[str, Any]], state: Any, goal
         expect(same, f"{name} must not depend on the desired goal, because relabelling replaces the goal alone; it does")
 
 
-def _check_mirror(env: Any, obs: Any, actions: jax.Array, tolerance: float) -> None:
-    """Checks mirror images of all states but the last. `obs` leads with [T+1, N] and `actions` with [T, N]."""
-    if not callable(getattr(env, "mirror", None)):
+def _check_mirror(env: Any, obs: Any, actions: NDArray, valid: NDArray, tolerance: float) -> None:
+    """Checks mirror images of the states in the mask `valid` [T, N]. `obs` and `actions` lead with [T, N], too."""
+    if not hasattr(env, "mirror"):
         return
-    observation, achieved, desired = (jax.tree.map(lambda x: x[:-1], obs[name]) for name in ("observation", *GOALS))
+    observation, achieved, desired = (jax.tree.map(lambda x: x[valid], obs[name]) for name in ("observation", *GOALS))
+    actions = actions[valid]
 
     def mirror(goal: Any) -> tuple[Any, Any]:
         image = env.mirror(observation, goal, actions)
