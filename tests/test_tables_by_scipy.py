@@ -238,13 +238,17 @@ def test_the_candidate_of_slide_passed():
 
 
 def test_what_mirror_images_gain():
-    """Of both tables of their trials: means. Of the second, Student's intervals of the paired differences."""
+    """Of both trials: means, and Student's intervals of the paired differences."""
     page = (ROOT / "docs" / "experiments" / "preset_mirror.md").read_text()
     lines = re.findall(r"\| (?:the preset|with mirror images) (\|.*\|)\n", page)
     assert len(lines) == 2
     for line in lines:
         *successes, mean = map(float, line.strip("| ").split(" | "))
         np.testing.assert_allclose(np.mean(successes), mean, atol=0.005)  # of rounded numbers
+    shown, pairs = re.search(r"They gain (.*), Student's t\).*\n?.*The pairs gain (.*)\. All", page).groups()
+    gains = np.array(re.findall(r"0\.\d{3}", pairs), float)
+    interval = scipy.stats.t.interval(0.95, len(gains) - 1, gains.mean(), scipy.stats.sem(gains))
+    np.testing.assert_allclose([gains.mean(), *interval], [*map(float, re.findall(r"0\.\d{3}", shown))], atol=0.0015)
     rows = re.findall(r"\| 61\d \| (.*) \| (.*) \|", page)
     assert len(rows) == 5
     before, after = (np.array([[float(n.replace(",", "")) for n in row[i].split(", ")] for row in rows]) for i in (0, 1))
