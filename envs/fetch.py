@@ -118,11 +118,8 @@ class FetchEnv(SimulatedTask):
 
     @property
     def mirror(self) -> MirrorFn:
-        """Mirror image at the vertical plane along x through the start of the gripper (docs/samplers.md). Raises AttributeError
-        if a subclass or mixin replaces a method, which may contradict it: it then needs its own `mirror`.
-        """
-        names = [name for name in dir(FetchEnv) if inspect.isfunction(getattr(FetchEnv, name)) and name != "__init__"]
-        if own := [name for name in names if getattr(type(self), name) is not getattr(FetchEnv, name)]:
+        """Image at the vertical plane along x through the gripper's start. AttributeError if a subclass replaces a method."""
+        if own := self._replaced(n for n in dir(FetchEnv) if n != "__init__" and inspect.isfunction(getattr(FetchEnv, n))):
             raise AttributeError(f"the inherited mirror may contradict its own {', '.join(own)}")
         from mjx_dher import mirror  # few runs need it
 

@@ -8,16 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_dher import check
+from mjx_dher import check, lookup
 from mjx_dher.types import Array, Batch, MirrorFn, PRNGKey
 
 
 def of_env(env: Any) -> MirrorFn:
-    """The method `mirror` of an environment. Raises ValueError if it has none."""
+    """The method `mirror` of an environment. Raises ValueError if it has none, or it is no function of three arguments."""
     try:
-        return cast("MirrorFn", env.mirror)
+        mirror = env.mirror
     except AttributeError as error:
         raise ValueError(f"augmentation mirror needs an environment with mirror(observation, goal, action): {error}") from error
+    return cast("MirrorFn", lookup.check_function("mirror", mirror, ("observation", "goal", "action")))
 
 
 def half(batch: Batch, mirror: MirrorFn, key: PRNGKey) -> Batch:
