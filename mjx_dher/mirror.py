@@ -17,7 +17,8 @@ def of_env(env: Any) -> MirrorFn:
     try:
         mirror = env.mirror
     except AttributeError as error:
-        raise ValueError(f"augmentation mirror needs an environment with mirror(observation, goal, action): {error}") from error
+        needed = "augmentation mirror needs an environment with mirror(observation, goal, action), and none does not"
+        raise ValueError(f"{needed}: {error}") from error
     return cast("MirrorFn", lookup.check_function("mirror", mirror, ("observation", "goal", "action")))
 
 

@@ -48,10 +48,8 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
     elif learner not in (None, best.learner):
         best = _DDPG._replace(learner=str(learner))
     run = (best.setup or {"cpu": _cpu, "gpu": _gpu, "frugal": _frugal, "paper": _paper}[name])(env)
-    if best is _CRL:
-        run = run.replace(action_l2=0.0, random_eps=0.1)
     networks = networks or ("fan_in" if name == "paper" else best.networks)
-    return run.replace(**{"env": env, "learner": best.learner, "networks": networks, **best.parts, **changes})
+    return run.replace(env=env, learner=best.learner, networks=networks, **best.changes).replace(**changes)
 
 
 def _kept(base: RunSpec, steps: int, **changes: Any) -> RunSpec:
@@ -78,7 +76,8 @@ def _cpu(env: str) -> RunSpec:
 
 
 def _cpu_push(env: str) -> RunSpec:
-    return _small(_cpu(env), updates_per_cycle=128, batch_size=512, policy_delay=2, total_steps=360_000, critic_lr=2e-3)
+    base = _small(_cpu(env), updates_per_cycle=128, batch_size=512, policy_delay=2, total_steps=288_000, critic_lr=2e-3)
+    return base.replace(augmentation="mirror")
 
 
 def _gpu(env: str) -> RunSpec:
@@ -168,7 +167,7 @@ def _cpu_slide(env: str) -> RunSpec:
 
 def _pick_and_place(env: str) -> RunSpec:
     base = _small(_entropy(env), num_envs=256, updates_per_cycle=500, policy_delay=2, critic_lr=3e-3)
-    return _kept(base, 704_000, her_k=8.0, hindsight_reward=0.5)
+    return _kept(base, 512_000, her_k=8.0, hindsight_reward=0.5, augmentation="mirror")
 
 
 class _Best(NamedTuple):
@@ -177,12 +176,12 @@ class _Best(NamedTuple):
     learner: str
     networks: str
     setup: Callable[[str], RunSpec] | None
-    parts: Mapping[str, str] = {}  # fields of the run that differ from RunSpec's defaults
+    changes: Mapping[str, Any] = {}  # other settings that differ from those of `setup`
 
 
 _DDPG = _Best("ddpg", "mlp", None)
 _PICK_AND_PLACE = _Best("tqc", "layer_norm", _pick_and_place, {"priority": "energy"})
-_CRL = _Best("crl", "mlp", None, {"sampler": "geometric"})  # for each task and preset
+_CRL = _Best("crl", "mlp", None, {"sampler": "geometric", "action_l2": 0.0, "random_eps": 0.1})  # for each task and preset
 _LEARNERS = {  # by preset, and environment or robot
     ("cpu", "hand"): _Best("dtqc", "layer_norm", _cpu_hand, {"priority": "td_error"}),
     ("gpu", "hand"): _Best("dtqc", "layer_norm", _gpu_hand),
@@ -194,6 +193,7 @@ _LEARNERS = {  # by preset, and environment or robot
     ("cpu", "push"): _Best("td3", "mlp", _cpu_push),
     ("cpu", "pick_and_place"): _PICK_AND_PLACE,
     ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error"}),
+    ("gpu", "push"): _Best("ddpg", "mlp", lambda env: _gpu(env).replace(augmentation="mirror")),
     ("gpu", "hand_reach"): _Best("ddpg", "mlp", _gpu_hand_reach),
     ("gpu", "pick_and_place"): _PICK_AND_PLACE,
     ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide, {"priority": "td_error"}),

@@ -116,12 +116,12 @@ def test_success_at_any_step_is_that_of_the_file():
         assert f"the first {last:,} of" in " ".join(page.split())
 
 
-def paired(file, task, arm, base):
-    """Mean gain in mean success and its interval, from a file of runs, with learners other than `paper`."""
+def paired(file, task, arm, base, paper=False):
+    """Mean gain in mean success and its interval, from a file of runs, with learners other than `paper`, or with it."""
     runs = {}
     with (ROOT / "docs" / file).open() as rows:
         for row in csv.DictReader(rows):
-            if row["task"] == task and row["learner"] != "paper":
+            if row["task"] == task and (row["learner"] == "paper") == paper:
                 runs.setdefault(row["arm"], {})[row["seed"]] = float(row["mean_success"])
     return interval(np.array([x - runs[base][seed] for seed, x in runs[arm].items()]))
 
@@ -154,6 +154,19 @@ def test_what_the_pages_say_of_td_error_and_of_the_break_off_point():
             shown = f"gains {gain:.3f} ({low:.3f} to {high:.3f})", f"loses {losses[0]}"
             assert all(part in text for part in shown for text in (helps, readme))
             assert f"loses {losses[0]} on Slide and {losses[1]} on `block_rotate_z`" in helps
+
+    more, half, whole = (
+        [paired("td_controls_runs.csv", task, *of, paper=True) for task in ("pick_and_place", "slide")]
+        for of in (("td_error_whole", "td_error"), ("td_error", "future"), ("td_error_whole", "future"))
+    )
+    row = page.partition("| `td_error_whole` less `td_error`, DDPG |")[2].split("|")[:3:2]
+    assert [cell.strip() for cell in row] == ["{:+.3f} ({:+.3f} to {:+.3f})".format(*found) for found in more]
+    assert "gains {:.3f} ({:.3f} to {:.3f}) and all of it {:.3f} ({:.3f} to {:.3f})".format(*half[0], *whole[0]) in page
+    loss, high, low = (-x for x in whole[1])
+    assert all(f"loses {loss:.3f} ({low:.3f} to {high:.3f})" in text for text in (page, helps))
+    assert f"half of the batch gains {half[0][0]:.3f} on PickAndPlace" in helps
+    assert "the whole {:.3f} ({:.3f} to {:.3f})".format(*whole[0]) in helps
+    assert half[1][1] < 0.0 < half[1][2]
 
     curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
     with (ROOT / "docs" / "break_off.csv").open() as file:

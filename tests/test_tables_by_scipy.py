@@ -259,6 +259,57 @@ def test_what_mirror_images_gain():
         np.testing.assert_allclose([column.mean(), *interval], [mean, low, high], atol=allowed)
 
 
+MIRROR_RUNS = {  # (preset, task, environment steps): first cells of the row
+    ("cpu", "push", 360_000): "`cpu`, `push`",
+    ("cpu", "push", 288_000): "`cpu`, `push`",
+    ("gpu", "push", 1_536_000): "`gpu`, `push`",
+    ("gpu", "push", 921_600): "`gpu`, `push`, `lr_end` 0.05",
+    ("gpu", "pick_and_place", 704_000): "`gpu`, `pick_and_place`",
+    ("gpu", "pick_and_place", 512_000): "`gpu`, `pick_and_place`",
+    ("cpu", "slide", 1_280_000): "`cpu`, `slide`",
+}
+
+
+def with_interval(gains, form="{:+.3f} ({:.3f} to {:.3f})"):
+    return form.format(gains.mean(), *scipy.stats.t.interval(0.95, len(gains) - 1, gains.mean(), scipy.stats.sem(gains)))
+
+
+def test_what_mirror_images_gain_on_a_gpu():
+    runs = {}
+    with (ROOT / "docs" / "preset_mirror_runs.csv").open() as file:
+        for row in csv.DictReader(file):
+            of = runs.setdefault((row["preset"], row["task"], int(row["env_steps"])), {"plain": {}, "mirror": {}})
+            measure = row["late_success" if row["task"] == "slide" else "mean_success"]
+            of[row["setting"]][int(row["seed"])] = float(measure), float(row["final"]), float(row["steps_to_0.9"])
+    assert runs.keys() == MIRROR_RUNS.keys()
+    page = " ".join((ROOT / "docs" / "experiments" / "preset_mirror.md").read_text().split())
+    arrays = {}
+    for of, name in MIRROR_RUNS.items():
+        assert all(list(seeds) == list(range(690, 710)) for seeds in runs[of].values())
+        plain, mirror = (np.array(list(runs[of][setting].values())).T for setting in ("plain", "mirror"))
+        arrays[of] = plain, mirror
+        measured, last = (f"{a.mean():.3f}, {b.mean():.3f} | {with_interval(b - a)}" for a, b in zip(plain[:2], mirror))
+        assert f"| {name} | {of[2]:,} | {measured} | {(mirror[0] > plain[0]).sum()} | {last} |" in page
+    helps = (ROOT / "docs" / "what_helps.md").read_text()
+    shown = [f"{(mirror[0] - plain[0]).mean():+.3f}" for plain, mirror in arrays.values()]
+    assert f"(Push with `gpu`: {shown[2]}) | {shown[0]} | {shown[4]} | not shown | [mirror images]" in helps
+    for task, preset in (("push", "cpu"), ("pick_and_place", "gpu")):
+        (plain, mirror), *_ = [pair for of, pair in arrays.items() if of[:2] == (preset, task)]
+        sooner = plain[2] - mirror[2]
+        low, high = scipy.stats.t.interval(0.95, 19, sooner.mean(), scipy.stats.sem(sooner))
+        assert re.search(rf"{sooner.mean():,.0f} (steps )?\({low:,.0f} to {high:,.0f}\)", page)
+    for long, short in (
+        (("cpu", "push", 360_000), ("cpu", "push", 288_000)),
+        (("gpu", "pick_and_place", 704_000), ("gpu", "pick_and_place", 512_000)),
+    ):
+        mirror = arrays[short][1][1]
+        assert f"differs by {with_interval(mirror - arrays[long][0][1])} from that of {long[2]:,} steps" in page
+        assert f"seed has {mirror.min():.3f}" in page
+        assert np.median(mirror) - mirror.min() < 0.05
+    lost = arrays["gpu", "push", 1_536_000][0][1] - arrays["gpu", "push", 921_600][1][1]
+    assert f"921,600 steps lose {with_interval(lost, '{:.3f} ({:.3f} to {:.3f})')}" in page
+
+
 def test_what_hindsight_gains():
     """Of the table of runs with and without hindsight: means, and Student's interval of the paired difference."""
     section = (ROOT / "docs" / "experiments" / "preset_gpu.md").read_text().split("## Without hindsight")[1].split("\n## ")[0]
