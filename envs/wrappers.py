@@ -39,7 +39,7 @@ class WrapperState:
 class Wrapper:
     """Base class: passes actions and observations on unchanged. Goals, rewards and success come from the inner environment."""
 
-    keeps_mirror = False  # whether the inner environment's `mirror` holds for the wrapper's observations and actions
+    keeps_mirror = False  # whether the inner environment's `mirror` holds for this class; subclasses do not inherit it
 
     def __init__(self, env: Any):
         check_env_parts(env)
@@ -53,7 +53,7 @@ class Wrapper:
         if name in ("init_state", "first_state"):  # they have no key for the wrapper's memory
             raise AttributeError(f"a wrapped environment has no {name}: use reset(key)")
         own = getattr(self.env, name)  # mirror, with_goal and with_object only if the environment has them
-        if name == "mirror" and not self.keeps_mirror:
+        if name == "mirror" and not vars(type(self)).get("keeps_mirror"):
             raise AttributeError(f"the mirror of {type(self.env).__name__} may contradict {type(self).__name__}")
         return {"with_goal": self._with_goal, "with_object": self._with_object}.get(name, own)
 

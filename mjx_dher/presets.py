@@ -76,8 +76,7 @@ def _cpu(env: str) -> RunSpec:
 
 
 def _cpu_push(env: str) -> RunSpec:
-    base = _small(_cpu(env), updates_per_cycle=128, batch_size=512, policy_delay=2, total_steps=288_000, critic_lr=2e-3)
-    return base.replace(augmentation="mirror")
+    return _small(_cpu(env), updates_per_cycle=128, batch_size=512, policy_delay=2, total_steps=288_000, critic_lr=2e-3)
 
 
 def _gpu(env: str) -> RunSpec:
@@ -167,7 +166,7 @@ def _cpu_slide(env: str) -> RunSpec:
 
 def _pick_and_place(env: str) -> RunSpec:
     base = _small(_entropy(env), num_envs=256, updates_per_cycle=500, policy_delay=2, critic_lr=3e-3)
-    return _kept(base, 512_000, her_k=8.0, hindsight_reward=0.5, augmentation="mirror")
+    return _kept(base, 512_000, her_k=8.0, hindsight_reward=0.5)
 
 
 class _Best(NamedTuple):
@@ -180,7 +179,7 @@ class _Best(NamedTuple):
 
 
 _DDPG = _Best("ddpg", "mlp", None)
-_PICK_AND_PLACE = _Best("tqc", "layer_norm", _pick_and_place, {"priority": "energy"})
+_PICK_AND_PLACE = _Best("tqc", "layer_norm", _pick_and_place, {"priority": "energy", "augmentation": "mirror"})
 _CRL = _Best("crl", "mlp", None, {"sampler": "geometric", "action_l2": 0.0, "random_eps": 0.1})  # for each task and preset
 _LEARNERS = {  # by preset, and environment or robot
     ("cpu", "hand"): _Best("dtqc", "layer_norm", _cpu_hand, {"priority": "td_error"}),
@@ -190,10 +189,10 @@ _LEARNERS = {  # by preset, and environment or robot
     ("cpu", "hand_reach"): _Best(
         "ddpg", "mlp", lambda env: _kept(_gpu_hand_reach(env), 480_000, num_envs=64, cycles_per_epoch=5, updates_per_cycle=80)
     ),
-    ("cpu", "push"): _Best("td3", "mlp", _cpu_push),
+    ("cpu", "push"): _Best("td3", "mlp", _cpu_push, {"augmentation": "mirror"}),
     ("cpu", "pick_and_place"): _PICK_AND_PLACE,
     ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error"}),
-    ("gpu", "push"): _Best("ddpg", "mlp", lambda env: _gpu(env).replace(augmentation="mirror")),
+    ("gpu", "push"): _Best("ddpg", "mlp", None, {"augmentation": "mirror"}),
     ("gpu", "hand_reach"): _Best("ddpg", "mlp", _gpu_hand_reach),
     ("gpu", "pick_and_place"): _PICK_AND_PLACE,
     ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide, {"priority": "td_error"}),

@@ -10,7 +10,7 @@ import pytest
 from conftest import refuses
 
 from mjx_dher import HParams, envs, make_train
-from mjx_dher.envs.fetch import Push, fetch_observation
+from mjx_dher.envs.fetch import ASSETS, Push, fetch_observation
 from mjx_dher.envs.wrappers import ActionDelay, FrameStack, ObservationNoise, Wrapper
 from mjx_dher.mirror import half
 from mjx_dher.testing import check_env
@@ -157,13 +157,21 @@ class Reversed(Wrapper):
         return memory, observation[..., ::-1]
 
 
+class Delayed(ActionDelay):
+    def act(self, memory, action):
+        return super().act(memory, action[::-1])
+
+
 def test_an_inherited_mirror_that_may_be_wrong_is_refused():
     """It would be wrong without an error where the sizes agree."""
     config = dataclasses.replace(MIRRORED, replay_size=1000)
+    scene = type("Scene", (Push,), {"task": dataclasses.replace(Push.task, xml=str(ASSETS / "push.xml"))})
     for env, reason in (
         (Seen("native"), "own describe, observe"),
         (Rewarded("native"), "own compute_reward"),
+        (scene("native"), "own scene"),
         (Reversed(Plane()), "mirror of Plane may contradict Reversed"),
+        (Delayed(Plane(), 1), "mirror of Plane may contradict Delayed"),
     ):
         assert not hasattr(env, "mirror")
         with pytest.raises(ValueError, match=f"augmentation mirror needs .*none does not: .*{reason}"):
