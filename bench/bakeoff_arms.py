@@ -199,6 +199,7 @@ def parts_of(task: str, arm: Arm) -> dict[str, str]:
 
 
 _AS_OF: dict[str, dict[str, Any]] = {  # 2026-11-25, the hand 2026-11-27
+    "push": {"augmentation": "none"},
     "pick_and_place": {"num_envs": 512, "replay_size": 4_000_000},
     "slide": {"policy_delay": 1, "renewals": 0, "learner_dtype": "float32"},
     "block_rotate_z": {"her_k": 4.0},
@@ -208,7 +209,7 @@ _AS_OF: dict[str, dict[str, Any]] = {  # 2026-11-25, the hand 2026-11-27
 def tuned(task: str, **parts: str) -> RunSpec:
     """The run of the preset `gpu` that these experiments start from, with `parts` replaced.
 
-    For PickAndPlace and Slide it is that preset as of 2026-11-25. On PickAndPlace that is `frugal` with 512 environments and a
+    For Push, PickAndPlace and Slide it is that preset as of 2026-11-25. On PickAndPlace that is `frugal` with 512 environments and a
     larger ring. On Block Z, k is 4, as until 2026-11-27.
     """
     run = presets.preset("frugal" if task == "pick_and_place" else "gpu", task, **parts)
