@@ -209,8 +209,8 @@ _AS_OF: dict[str, dict[str, Any]] = {  # 2026-11-25, the hand 2026-11-27
 def tuned(task: str, **parts: str) -> RunSpec:
     """The run of the preset `gpu` that these experiments start from, with `parts` replaced.
 
-    For Push, PickAndPlace and Slide it is that preset as of 2026-11-25. On PickAndPlace that is `frugal` with 512 environments and a
-    larger ring. On Block Z, k is 4, as until 2026-11-27.
+    For Push, PickAndPlace and Slide it is that preset as of 2026-11-25. On PickAndPlace that is `frugal` with 512 environments
+    and a larger ring. On Block Z, k is 4, as until 2026-11-27.
     """
     run = presets.preset("frugal" if task == "pick_and_place" else "gpu", task, **parts)
     return run.replace(**_AS_OF.get(task, {}))

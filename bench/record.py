@@ -79,7 +79,8 @@ def measure(repeats: int) -> tuple[dict[str, float], dict[str, Any]]:
     spec = presets.preset(preset, "push", learner="ddpg")
     run = spec.config
     steps = str(2 * config.steps_per_epoch(run, 50))
-    command = ["--env", "push", "--preset", preset, "--learner", "ddpg", "--total-steps", steps, "--no-curve"]
+    alike = ("--learner", "ddpg", "--augmentation", "none")  # as in earlier records
+    command = ["--env", "push", "--preset", preset, *alike, "--total-steps", steps, "--no-curve"]
     with tempfile.TemporaryDirectory() as home:
         starts = [startup.measure(command, home)["to the first epoch"] for _ in range(1 + repeats)]
 

@@ -2,7 +2,7 @@
 
 import abc
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -113,18 +113,15 @@ class SimulatedTask(GoalEnv):
 
     def check_own(self) -> None:
         """Finds the observation's size if a subclass or mixin replaces `observe`, and checks an own `achieved`."""
-        own = self._replaced(("observe", "achieved", "spec"))
+        owners = type(self).__mro__
+        base = owners[owners.index(SimulatedTask) - 1]  # MujocoTask or FetchEnv
+        own = [name for name in ("observe", "achieved", "spec") if getattr(type(self), name) is not getattr(base, name)]
         if "observe" in own and (shape := self._shape_of("observe")) is not None:
             if "spec" not in own and len(shape) != 1:
                 raise ValueError(f"observe must return a vector; got shape {list(shape)}")
             self.observation_size = shape[0] if len(shape) == 1 else self.observation_size
         if "achieved" in own and (shape := self._shape_of("achieved")) not in (None, (self.goal_size,)):
             raise ValueError(f"achieved must return a goal [{self.goal_size}]; got shape {list(shape)}")
-
-    def _replaced(self, names: Iterable[str]) -> list[str]:
-        """Those of the members `names` that a subclass or mixin replaces."""
-        base = type(self).__mro__[type(self).__mro__.index(SimulatedTask) - 1]  # MujocoTask or FetchEnv
-        return [name for name in names if getattr(type(self), name) is not getattr(base, name)]
 
     def _shape_of(self, method: str) -> tuple[int, ...] | None:
         """Shape of a method's result for the start, or None if it uses an attribute that a constructor sets later."""

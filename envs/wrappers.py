@@ -39,7 +39,7 @@ class WrapperState:
 class Wrapper:
     """Base class: passes actions and observations on unchanged. Goals, rewards and success come from the inner environment."""
 
-    keeps_mirror = False  # whether the inner environment's `mirror` holds for this class; subclasses do not inherit it
+    keeps_mirror = False  # whether the inner environment's `mirror` holds for this class. Subclasses do not inherit it.
 
     def __init__(self, env: Any):
         check_env_parts(env)
@@ -54,7 +54,7 @@ class Wrapper:
             raise AttributeError(f"a wrapped environment has no {name}: use reset(key)")
         own = getattr(self.env, name)  # mirror, with_goal and with_object only if the environment has them
         if name == "mirror" and not vars(type(self)).get("keeps_mirror"):
-            raise AttributeError(f"the mirror of {type(self.env).__name__} may contradict {type(self).__name__}")
+            raise AttributeError(f"the inner mirror may contradict {type(self).__name__}, without keeps_mirror = True")
         return {"with_goal": self._with_goal, "with_object": self._with_object}.get(name, own)
 
     def begin(self, key: PRNGKey, observation: PyTree, rest: Array) -> tuple[PyTree, PyTree]:
@@ -201,6 +201,8 @@ class FrameStack(Wrapper):
       frame_stack: n in [1, 100].
     """
 
+    keeps_mirror = True
+
     def __init__(self, env: Any, frame_stack: int):
         super().__init__(env)
         check_number("frame_stack", frame_stack, "[1, 100]")
@@ -216,7 +218,7 @@ class FrameStack(Wrapper):
     @property
     def mirror(self) -> MirrorFn:
         """The inner environment's `mirror`, applied to each frame. Raises AttributeError if it has none."""
-        inner = self.env.mirror
+        inner = self.__getattr__("mirror")
 
         def of_frames(observation: PyTree, goal: Array, action: Array) -> tuple[PyTree, Array, Array]:
             leaves, structure = jax.tree.flatten(observation)

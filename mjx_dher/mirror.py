@@ -17,8 +17,8 @@ def of_env(env: Any) -> MirrorFn:
     try:
         mirror = env.mirror
     except AttributeError as error:
-        needed = "augmentation mirror needs an environment with mirror(observation, goal, action), and none does not"
-        raise ValueError(f"{needed}: {error}") from error
+        needed = "augmentation mirror needs the environment's method mirror(observation, goal, action)"
+        raise ValueError(f"{needed}: {error}. Without it, choose augmentation none") from error
     return cast("MirrorFn", lookup.check_function("mirror", mirror, ("observation", "goal", "action")))
 
 

@@ -33,7 +33,8 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
     rolls out the workers' episodes in parallel and takes the gradient of their joint batch.
 
     Args:
-      learner: learner. Default: the preset's, which may bring its own numbers and priority. Others use the numbers of `ddpg`.
+      learner: learner. Default: the preset's, which may bring its own numbers and priority. Others use the numbers of `ddpg`,
+        and the preset's augmentation (`crl`: none).
       networks: networks. Default: the preset's for this learner.
       **changes: other settings (`RunSpec.replace`), such as `sampler`, `seed` or `num_envs`. A whole `config` or `hparams`
         replaces all of the preset's.
@@ -46,7 +47,7 @@ def preset(name: str, env: str, learner: str | None = None, networks: str | None
     if learner == "crl":
         best = _CRL
     elif learner not in (None, best.learner):
-        best = _DDPG._replace(learner=str(learner))
+        best = _DDPG._replace(learner=str(learner), changes={"augmentation": best.changes.get("augmentation", "none")})
     run = (best.setup or {"cpu": _cpu, "gpu": _gpu, "frugal": _frugal, "paper": _paper}[name])(env)
     networks = networks or ("fan_in" if name == "paper" else best.networks)
     return run.replace(env=env, learner=best.learner, networks=networks, **best.changes).replace(**changes)

@@ -167,6 +167,12 @@ def test_what_the_pages_say_of_td_error_and_of_the_break_off_point():
     assert f"half of the batch gains {half[0][0]:.3f} on PickAndPlace" in helps
     assert "the whole {:.3f} ({:.3f} to {:.3f})".format(*whole[0]) in helps
     assert half[1][1] < 0.0 < half[1][2]
+    assert (
+        "all of it gains {:.3f} there over `uniform`".format(
+            paired("td_controls_runs.csv", "slide", "td_error_whole", "uniform")[0]
+        )
+        in page
+    )
 
     curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
     with (ROOT / "docs" / "break_off.csv").open() as file:

@@ -293,11 +293,14 @@ def test_what_mirror_images_gain_on_a_gpu():
     helps = (ROOT / "docs" / "what_helps.md").read_text()
     shown = [f"{(mirror[0] - plain[0]).mean():+.3f}" for plain, mirror in arrays.values()]
     assert f"(Push with `gpu`: {shown[2]}) | {shown[0]} | {shown[4]} | not shown | [mirror images]" in helps
-    for task, preset in (("push", "cpu"), ("pick_and_place", "gpu")):
-        (plain, mirror), *_ = [pair for of, pair in arrays.items() if of[:2] == (preset, task)]
-        sooner = plain[2] - mirror[2]
-        low, high = scipy.stats.t.interval(0.95, 19, sooner.mean(), scipy.stats.sem(sooner))
-        assert re.search(rf"{sooner.mean():,.0f} (steps )?\({low:,.0f} to {high:,.0f}\)", page)
+    steps = "{:,.0f} ({:,.0f} to {:,.0f})"
+    for of, form in (
+        (("cpu", "push", 360_000), "{:,.0f} steps ({:,.0f} to {:,.0f})"),
+        (("gpu", "pick_and_place", 704_000), steps),
+        (("gpu", "push", 1_536_000), steps),
+        (("gpu", "push", 921_600), steps),
+    ):
+        assert with_interval(arrays[of][0][2] - arrays[of][1][2], form) in page
     for long, short in (
         (("cpu", "push", 360_000), ("cpu", "push", 288_000)),
         (("gpu", "pick_and_place", 704_000), ("gpu", "pick_and_place", 512_000)),
@@ -306,6 +309,8 @@ def test_what_mirror_images_gain_on_a_gpu():
         assert f"differs by {with_interval(mirror - arrays[long][0][1])} from that of {long[2]:,} steps" in page
         assert f"seed has {mirror.min():.3f}" in page
         assert np.median(mirror) - mirror.min() < 0.05
+        loses = with_interval(arrays[long][0][1] - arrays[short][0][1], "{:.3f} ({:.3f} to {:.3f})")
+        assert short[1] == "push" or f"the shorter runs would lose {loses}" in page
     lost = arrays["gpu", "push", 1_536_000][0][1] - arrays["gpu", "push", 921_600][1][1]
     assert f"921,600 steps lose {with_interval(lost, '{:.3f} ({:.3f} to {:.3f})')}" in page
 
