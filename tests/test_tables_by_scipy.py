@@ -275,13 +275,17 @@ def with_interval(gains, form="{:+.3f} ({:.3f} to {:.3f})"):
 
 
 def test_what_mirror_images_gain_on_a_gpu():
-    runs = {}
+    runs, native = {}, []
     with (ROOT / "docs" / "preset_mirror_runs.csv").open() as file:
         for row in csv.DictReader(file):
+            native += [(float(row["final"]), float(row["native"]))] if (row["task"], row["setting"]) == ("slide", "plain") else []
             of = runs.setdefault((row["preset"], row["task"], int(row["env_steps"])), {"plain": {}, "mirror": {}})
             measure = row["late_success" if row["task"] == "slide" else "mean_success"]
             of[row["setting"]][int(row["seed"])] = float(measure), float(row["final"]), float(row["steps_to_0.9"])
     assert runs.keys() == MIRROR_RUNS.keys()
+    there, here = np.array(native).T
+    screen = " ".join((ROOT / "docs" / "experiments" / "preset_screen.md").read_text().split())
+    assert f"{there.mean():.3f} on `warp` and {here.mean():.3f} on `native`, {with_interval(here - there)}" in screen
     page = " ".join((ROOT / "docs" / "experiments" / "preset_mirror.md").read_text().split())
     arrays = {}
     for of, name in MIRROR_RUNS.items():
