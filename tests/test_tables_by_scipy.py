@@ -278,7 +278,8 @@ def test_what_mirror_images_gain_on_a_gpu():
     runs, native = {}, []
     with (ROOT / "docs" / "preset_mirror_runs.csv").open() as file:
         for row in csv.DictReader(file):
-            native += [(float(row["final"]), float(row["native"]))] if (row["task"], row["setting"]) == ("slide", "plain") else []
+            if (row["task"], row["setting"]) == ("slide", "plain"):
+                native.append((float(row["final"]), float(row["native"])))
             of = runs.setdefault((row["preset"], row["task"], int(row["env_steps"])), {"plain": {}, "mirror": {}})
             measure = row["late_success" if row["task"] == "slide" else "mean_success"]
             of[row["setting"]][int(row["seed"])] = float(measure), float(row["final"]), float(row["steps_to_0.9"])
