@@ -50,7 +50,7 @@ def spec_of(learner: str, task: str, arm: Arm, toy: bool = False) -> RunSpec:
     sizes = {**TOY, "target_period": 1} if toy else {**SHARED, **SIZES[task], "replay_size": SIZES[task]["total_steps"]}
     numbers = HParams(gamma=GAMMA.get(task, 0.98), polyak=0.98, action_l2=0.0, entropy_weight=0.1, random_eps=0.1)
     common: dict[str, Any] = {"n_step": 1, "num_critics": 2, "policy_delay": 1, "renewals": 0, "learner_dtype": "float32"}
-    common["augmentation"] = "none"  # as when these runs were planned
+    common |= {"augmentation": "none"}  # the preset had none when these runs were planned
     return run.replace(hparams=numbers._replace(**arm.numbers), **common, **sizes)
 
 

@@ -117,10 +117,10 @@ class FetchEnv(SimulatedTask):
 
     @property
     def mirror(self) -> MirrorFn:
-        """Image at the vertical plane along x through the gripper's start. AttributeError without `keeps_mirror`."""
+        """Image at the vertical plane along x through the gripper's start. A subclass needs `keeps_mirror` (AttributeError)."""
         if type(self).__module__ != __name__ and not vars(type(self)).get("keeps_mirror"):
-            raise AttributeError(f"the inherited mirror may contradict {type(self).__name__}, without keeps_mirror = True")
-        from mjx_dher import mirror  # few runs need it
+            raise AttributeError(f"the inherited mirror may contradict {type(self).__name__}, unless it sets keeps_mirror")
+        from mjx_dher import mirror  # only runs with mirror images need it
 
         return functools.partial(mirror.across_y, self._entries, self.task.initial_grip_pos[1])
 

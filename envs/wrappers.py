@@ -54,7 +54,7 @@ class Wrapper:
             raise AttributeError(f"a wrapped environment has no {name}: use reset(key)")
         own = getattr(self.env, name)  # mirror, with_goal and with_object only if the environment has them
         if name == "mirror" and not vars(type(self)).get("keeps_mirror"):
-            raise AttributeError(f"the inner mirror may contradict {type(self).__name__}, without keeps_mirror = True")
+            raise AttributeError(f"the inner mirror may contradict {type(self).__name__}, unless it sets keeps_mirror")
         return {"with_goal": self._with_goal, "with_object": self._with_object}.get(name, own)
 
     def begin(self, key: PRNGKey, observation: PyTree, rest: Array) -> tuple[PyTree, PyTree]:
@@ -218,7 +218,7 @@ class FrameStack(Wrapper):
     @property
     def mirror(self) -> MirrorFn:
         """The inner environment's `mirror`, applied to each frame. Raises AttributeError if it has none."""
-        inner = self.__getattr__("mirror")
+        inner = self.__getattr__("mirror")  # refused for a subclass without keeps_mirror
 
         def of_frames(observation: PyTree, goal: Array, action: Array) -> tuple[PyTree, Array, Array]:
             leaves, structure = jax.tree.flatten(observation)

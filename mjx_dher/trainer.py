@@ -166,7 +166,7 @@ def make_train(
 def _augment(config: Config, env: Env) -> Callable[..., Batch] | None:
     if config.augmentation == "none":
         return None
-    from mjx_dher import mirror  # few runs need it
+    from mjx_dher import mirror  # only runs with mirror images need it
 
     return functools.partial(mirror.half, mirror=mirror.of_env(env))
 

@@ -16,6 +16,8 @@ def test_the_planned_comparisons_are_of_valid_runs(monkeypatch):
     """Each group is one program, arms differ, and numbers are those of the plan."""
     monkeypatch.syspath_prepend(ROOT / "bench")
     import as_published
+    import bakeoff_arms
+    import crl
     import hands
     import modern_critics
     import td_controls
@@ -44,6 +46,8 @@ def test_the_planned_comparisons_are_of_valid_runs(monkeypatch):
     assert (one.config.num_envs, one.config.batch_size, one.hparams.priority_fraction) == (2, 64, 1.0)
     assert (many.config.num_envs, many.config.batch_size, many.config.total_steps) == (38, 4864, 4_750_000)
     assert unseen.spec_of("cpu", "push", unseen.UNSEEN.arms[0]).sampler == "weighted"
+    for run in (bakeoff_arms.tuned("push"), *(crl.spec_of("", task, arm) for task in crl.SIZES for arm in crl.ARMS)):
+        assert run.config.augmentation == "none"  # planned before the presets had mirror images
 
 
 def test_runs_with_both_reward_conventions_differ_in_the_rewards_alone(monkeypatch):

@@ -25,6 +25,16 @@ def test_presets_know_the_robot_by_its_built_in_name():
         assert presets.preset("gpu", env, sampler="future").sampler == "future"
 
 
+def test_which_presets_have_mirror_images():
+    """All learners of a preset, so that they can be compared, but `crl`."""
+    of = lambda name, env, learner: presets.preset(name, env, learner).config.augmentation  # noqa: E731
+    for env in ("push", "pick_and_place"):
+        for name, expected in {"cpu": "mirror", "gpu": "mirror", "frugal": "none", "paper": "none"}.items():
+            assert {of(name, env, learner) for learner in (None, "ddpg", "td3", "tqc")} == {expected}
+            assert of(name, env, "crl") == "none"
+    assert {of(name, "slide", None) for name in presets.PRESETS} == {"none"}
+
+
 def test_tables_of_hands_and_arms_are_those_of_the_file():
     """Success on `native` and its median, on the presets' pages and beside others' on docs/field.md."""
     found: dict[str, list[dict[str, str]]] = {}
@@ -167,12 +177,8 @@ def test_what_the_pages_say_of_td_error_and_of_the_break_off_point():
     assert f"half of the batch gains {half[0][0]:.3f} on PickAndPlace" in helps
     assert "the whole {:.3f} ({:.3f} to {:.3f})".format(*whole[0]) in helps
     assert half[1][1] < 0.0 < half[1][2]
-    assert (
-        "all of it gains {:.3f} there over `uniform`".format(
-            paired("td_controls_runs.csv", "slide", "td_error_whole", "uniform")[0]
-        )
-        in page
-    )
+    over_uniform, *_ = paired("td_controls_runs.csv", "slide", "td_error_whole", "uniform")
+    assert f"all of it gains {over_uniform:.3f} there over `uniform`" in page
 
     curves: dict[str, dict[str, list[tuple[float, float]]]] = {}
     with (ROOT / "docs" / "break_off.csv").open() as file:

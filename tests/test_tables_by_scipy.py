@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.stats
 from conftest import ROOT
+from test_presets import interval
 
 THRESHOLD = {"push": 0.9, "pick_and_place": 0.9, "slide": 0.6}
 LAST = {"push": 10, "pick_and_place": 10, "slide": 20}
@@ -215,6 +216,10 @@ def test_effects_of_the_tuned_methods():
         assert said.format(gain=gains.mean(), loss=-gains.mean(), low=low, high=high) in tuned[arm], (task, arm)
 
 
+def with_interval(gains, form="{:+.3f} ({:.3f} to {:.3f})"):
+    return form.format(*interval(gains))
+
+
 def test_the_candidate_of_slide_passed():
     """Means, spreads and Student's intervals of the third stage, as preset_screen.md has them."""
     with (ROOT / "docs" / "preset_screen_slide_runs.csv").open() as file:
@@ -226,11 +231,7 @@ def test_the_candidate_of_slide_passed():
     page = " ".join((ROOT / "docs" / "experiments" / "preset_screen.md").read_text().split())
     for a, b in zip(late, final):
         assert f"| {a.mean():.3f} | {b.mean():.3f} ({b.min():.3f} to {b.max():.3f}) | {b.std(ddof=1):.3f} |" in page
-    gains = []
-    for preset, candidate in (late, final):
-        each = candidate - preset
-        low, high = scipy.stats.t.interval(0.95, 19, each.mean(), scipy.stats.sem(each))
-        gains.append(f"{each.mean():+.3f} ({low:.3f} to {high:.3f})")
+    gains = [with_interval(candidate - preset) for preset, candidate in (late, final)]
     assert f"| {gains[0]} | {gains[1]} |" in page
     assert f"in {(late[1] > late[0]).sum()} of 20 pairs" in page
     falls = [f"{np.median(each) - each.min():.3f}" for each in final[::-1]]
@@ -247,16 +248,14 @@ def test_what_mirror_images_gain():
         np.testing.assert_allclose(np.mean(successes), mean, atol=0.005)  # of rounded numbers
     shown, pairs = re.search(r"They gain (.*), Student's t\).*\n?.*The pairs gain (.*)\. All", page).groups()
     gains = np.array(re.findall(r"0\.\d{3}", pairs), float)
-    interval = scipy.stats.t.interval(0.95, len(gains) - 1, gains.mean(), scipy.stats.sem(gains))
-    np.testing.assert_allclose([gains.mean(), *interval], [*map(float, re.findall(r"0\.\d{3}", shown))], atol=0.0015)
+    np.testing.assert_allclose([*interval(gains)], [*map(float, re.findall(r"0\.\d{3}", shown))], atol=0.0015)
     rows = re.findall(r"\| 61\d \| (.*) \| (.*) \|", page)
     assert len(rows) == 5
     before, after = (np.array([[float(n.replace(",", "")) for n in row[i].split(", ")] for row in rows]) for i in (0, 1))
     shown = re.search(r"\| difference \| \| (.*) \|", page).group(1)
     numbers = [float(n.replace(",", "")) for n in re.findall(r"[-+][\d.]+(?:,\d{3})?", shown)]
     for column, (mean, low, high), allowed in zip((after - before).T, np.reshape(numbers, (3, 3)), (500, 0.001, 0.0005)):
-        interval = scipy.stats.t.interval(0.95, 4, column.mean(), scipy.stats.sem(column))
-        np.testing.assert_allclose([column.mean(), *interval], [mean, low, high], atol=allowed)
+        np.testing.assert_allclose([*interval(column)], [mean, low, high], atol=allowed)
 
 
 MIRROR_RUNS = {  # (preset, task, environment steps): first cells of the row
@@ -268,10 +267,6 @@ MIRROR_RUNS = {  # (preset, task, environment steps): first cells of the row
     ("gpu", "pick_and_place", 512_000): "`gpu`, `pick_and_place`",
     ("cpu", "slide", 1_280_000): "`cpu`, `slide`",
 }
-
-
-def with_interval(gains, form="{:+.3f} ({:.3f} to {:.3f})"):
-    return form.format(gains.mean(), *scipy.stats.t.interval(0.95, len(gains) - 1, gains.mean(), scipy.stats.sem(gains)))
 
 
 def test_what_mirror_images_gain_on_a_gpu():
@@ -311,11 +306,19 @@ def test_what_mirror_images_gain_on_a_gpu():
         (("gpu", "pick_and_place", 704_000), ("gpu", "pick_and_place", 512_000)),
     ):
         mirror = arrays[short][1][1]
-        assert f"differs by {with_interval(mirror - arrays[long][0][1])} from that of {long[2]:,} steps" in page
+        assert f"differs by {with_interval(mirror - arrays[long][0][1])} from the success after {long[2]:,} steps" in page
         assert f"seed has {mirror.min():.3f}" in page
         assert np.median(mirror) - mirror.min() < 0.05
         loses = with_interval(arrays[long][0][1] - arrays[short][0][1], "{:.3f} ({:.3f} to {:.3f})")
         assert short[1] == "push" or f"the shorter runs would lose {loses}" in page
+    with (ROOT / "docs" / "unseen_runs.csv").open() as file:
+        own = [
+            (row["task"], float(row["final"]), float(row["steps"])) for row in csv.DictReader(file) if row["learner"] == "cpu"
+        ]
+    for task, text in (("push", "Push ends at"), ("pick_and_place", "of PickAndPlace end at")):
+        final, first = np.array([row[1:] for row in own if row[0] == task]).T
+        assert f"{text} {with_interval(final, '{:.3f} ({:.3f} to {:.3f})')}, with {final.min():.3f} at least" in page
+        assert task == "push" or f"reach 0.90 after {np.median(first):,.0f} steps in the median" in page
     lost = arrays["gpu", "push", 1_536_000][0][1] - arrays["gpu", "push", 921_600][1][1]
     assert f"921,600 steps lose {with_interval(lost, '{:.3f} ({:.3f} to {:.3f})')}" in page
 
