@@ -192,12 +192,12 @@ _LEARNERS = {  # by preset, and environment or robot
     ),
     ("cpu", "push"): _Best("td3", "mlp", _cpu_push, {"augmentation": "mirror"}),
     ("cpu", "pick_and_place"): _PICK_AND_PLACE,
-    ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error"}),
+    ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error", "augmentation": "mirror"}),
     ("gpu", "push"): _Best("ddpg", "mlp", None, {"augmentation": "mirror"}),
     ("gpu", "hand_reach"): _Best("ddpg", "mlp", _gpu_hand_reach),
     ("gpu", "pick_and_place"): _PICK_AND_PLACE,
     ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide, {"priority": "td_error"}),
-    ("frugal", "push"): _Best("td3", "mlp", lambda env: _frugal(env).replace(noise_std=0.6)),
+    ("frugal", "push"): _Best("td3", "mlp", lambda env: _frugal(env).replace(noise_std=0.6), {"augmentation": "mirror"}),
     ("frugal", "pick_and_place"): _Best("tqc", "layer_norm", lambda env: _kept(_entropy(env), 500_000, num_envs=64)),
     ("frugal", "slide"): _Best(
         "dtqc", "layer_norm", lambda env: _small(_frugal(env), updates_per_cycle=150, n_step=3), {"priority": "td_error"}
