@@ -21,7 +21,7 @@ from mjx_dher.context import Context, one_of
 from mjx_dher.replay import ReplayState, Sample
 from mjx_dher.types import Array, Batch, Episode, PRNGKey
 
-CANDIDATES = 4  # transitions drawn per transition that `choose` keeps
+CANDIDATES = 4  # transitions among which one is chosen
 GRAVITY = 9.81  # m/s^2
 _ROWS_AT_ONCE = 256  # episodes whose errors are computed at a time, to limit memory
 
@@ -29,7 +29,7 @@ _ROWS_AT_ONCE = 256  # episodes whose errors are computed at a time, to limit me
 PriorityFn = Callable[[Episode, Context], Array]
 # renew(ring, context) -> weights [E] of all its rows, 0 or more; weights of empty rows are ignored
 RenewFn = Callable[[ReplayState, Context], Array]
-# choose(key, sample [CANDIDATES * B], batch [CANDIDATES * B], number B, context) -> indices [B] of the candidates
+# choose(key, sample [candidates * B], batch [candidates * B], number B, context) -> indices [B] of the candidates
 ChooseFn = Callable[[PRNGKey, Sample, Batch, int, Context], Array]
 
 
@@ -40,6 +40,7 @@ class Priority:
     weigh: PriorityFn | None = None  # weight of an episode when it is added
     renew: RenewFn | None = None  # weights of the ring's episodes, once per cycle, before learning
     choose: ChooseFn | None = None  # choice among relabelled transitions
+    candidates: int = CANDIDATES  # transitions drawn per transition that `choose` keeps
     uses_values: bool = False  # whether it reads `context.values`
     by_part: bool = False  # whether `renew` weighs each episode alone and may get part of the ring (`Config.renewals`)
     renews: Callable[[Context], Array] | None = None  # whether a lane's priority has `renew`, if lanes differ in it (`join`)
@@ -124,11 +125,10 @@ def choose(
 ) -> tuple[Sample, Batch]:
     """Chooses transitions among candidates.
 
-    With probability `priority_fraction`, `priority.choose` picks a transition. Otherwise it is the first of its CANDIDATES, as
-    if no more had been drawn.
+    With probability `priority_fraction`, `priority.choose` picks a transition. Otherwise it is the first of its candidates.
 
     Args:
-      sample: candidates, CANDIDATES * number of them.
+      sample: candidates, a multiple of `number`.
       batch: the candidates after relabelling.
       number: number of transitions to keep.
 
@@ -138,13 +138,16 @@ def choose(
     choose_key, coin_key = jax.random.split(key)
     indices = _choose(priority, choose_key, sample, batch, number, context)
     coin = jax.random.uniform(coin_key, (number,), jnp.float32) < context.hparams.priority_fraction
-    first = CANDIDATES * jnp.arange(number, dtype=jnp.int32)
-    kept = jnp.where(coin, jnp.clip(indices, 0, CANDIDATES * number - 1), first)
+    first = len(batch.reward) // number * jnp.arange(number, dtype=jnp.int32)
+    kept = jnp.where(coin, jnp.clip(indices, 0, len(batch.reward) - 1), first)
     return jax.tree.map(lambda x: x[kept], (sample, batch))
 
 
 def by_weight(weigh: Callable[[Sample, Batch, Context], Array]) -> ChooseFn:
-    """Makes a `choose` that keeps one of each CANDIDATES transitions, in proportion to the weights [B'] from `weigh`.
+    """Makes a `choose` that keeps one of CANDIDATES transitions, in proportion to the weights [B'] from `weigh`.
+
+    With `Priority.candidates` 1, each is weighed once and is a candidate of CANDIDATES choices, no two of which share another
+    (if 13 or more are drawn). So it can be kept several times in a draw, which is of many batches.
 
     A weight that is not positive and finite counts as 0. If all candidates have weight 0, the choice is uniform. Raises
     ValueError unless `weigh` returns one weight per transition.
@@ -153,13 +156,15 @@ def by_weight(weigh: Callable[[Sample, Batch, Context], Array]) -> ChooseFn:
     def choose(key: PRNGKey, sample: Sample, batch: Batch, number: int, context: Context) -> Array:
         weight = weigh(sample, batch, context)
         weight = check.array("priority: weights [B] of transitions", weight, batch.reward.shape, jnp.number)
-        weight = replay.as_priority(weight).reshape(number, CANDIDATES)
+        # The differences of 0, 1, 3 and 9 modulo 13 are all different.
+        apart = jnp.asarray([step * max(len(weight), 13) // 13 for step in (0, 1, 3, 9)], jnp.int32)
+        groups = (jnp.arange(number, dtype=jnp.int32)[:, None] + apart) % len(weight)
+        weight = replay.as_priority(weight)[groups]
         weight = weight * replay.sum_factor(weight)
         total = jnp.cumsum(jnp.where(jnp.sum(weight, axis=1, keepdims=True) > 0, weight, 1.0), axis=1)
         # 1 - u lies in (0, 1], so a weight of 0 is never the first to reach it.
         threshold = (1.0 - jax.random.uniform(key, (number, 1), jnp.float32)) * total[:, -1:]
-        place = jnp.argmax(total >= threshold, axis=1).astype(jnp.int32)
-        return CANDIDATES * jnp.arange(number, dtype=jnp.int32) + place
+        return groups[jnp.arange(number), jnp.argmax(total >= threshold, axis=1)]
 
     return choose
 
@@ -173,10 +178,12 @@ def join(choices: Sequence[Priority | PriorityFn]) -> Priority:
         return made[0]
     index = "priority_choice"
     renewed = [own.renew is not None for own in made]
+    each = [lambda ring, context, own=own: renew(own, ring, context).priority for own in made]
     return Priority(
         weigh=one_of([functools.partial(_weigh, own) for own in made], index) if any(own.weigh for own in made) else None,
-        renew=one_of([functools.partial(_renew, own) for own in made], index) if any(own.renew for own in made) else None,
+        renew=one_of(each, index) if any(renewed) else None,
         choose=one_of([functools.partial(_choose, own) for own in made], index) if any(own.choose for own in made) else None,
+        candidates=max((own.candidates for own in made if own.choose), default=1),
         uses_values=any(own.uses_values for own in made),
         by_part=all(own.by_part for own in made if own.renew),
         renews=one_of([lambda context, own=own: jnp.asarray(own) for own in renewed], index) if any(renewed) else None,
@@ -188,14 +195,10 @@ def _weigh(priority: Priority, episode: Episode, context: Context) -> Array:
     return jnp.asarray(weight, jnp.float32)
 
 
-def _renew(priority: Priority, ring: ReplayState, context: Context) -> Array:
-    return renew(priority, ring, context).priority
-
-
 def _choose(priority: Priority, key: PRNGKey, sample: Sample, batch: Batch, number: int, context: Context) -> Array:
     """Indices [number] of the candidates to keep, int32. Without `choose`, they are the first of each group."""
     if priority.choose is None:
-        return CANDIDATES * jnp.arange(number, dtype=jnp.int32)
+        return len(batch.reward) // number * jnp.arange(number, dtype=jnp.int32)
     indices = priority.choose(key, sample, batch, number, context)
     return check.array("priority: indices [B] of choose", indices, (number,), jnp.integer).astype(jnp.int32)
 
@@ -215,8 +218,7 @@ def energy(episode: Episode, context: Context, most: float = math.inf) -> Array:
     return jnp.sum(jnp.clip(total[1:] - total[:-1], 0.0, most))
 
 
-# With the clip of the authors' runs on PickAndPlace, in J per kg and step.
-energy_clipped = functools.partial(energy, most=0.5)
+energy_clipped = functools.partial(energy, most=0.5)  # J per kg and step, as in the authors' runs on PickAndPlace
 
 
 def displacements(achieved: Array) -> Array:
@@ -245,8 +247,7 @@ def _mean_error(ring: ReplayState, context: Context) -> Array:
         size = jnp.abs(context.td_error(batch))
         if not ring.ends:
             return jnp.mean(size)
-        played = step < episode.length
-        return jnp.sum(jnp.where(played, size, 0.0)) / jnp.maximum(episode.length, 1).astype(size.dtype)
+        return jnp.sum(size, where=step < episode.length) / jnp.maximum(episode.length, 1).astype(size.dtype)
 
     return jax.lax.map(of_episode, ring.episodes, batch_size=min(replay.capacity(ring), _ROWS_AT_ONCE))
 
@@ -255,6 +256,7 @@ def _mean_error(ring: ReplayState, context: Context) -> Array:
 td_error = Priority(
     renew=_mean_error,
     choose=by_weight(lambda sample, batch, context: jnp.abs(context.td_error(batch))),
+    candidates=1,
     uses_values=True,
     by_part=True,
 )

@@ -162,7 +162,7 @@ def draw_batches(
     if priority is None or priority.choose is None:
         sample, batch = draw(number)
     else:
-        candidates = draw(priorities.CANDIDATES * number)
+        candidates = draw(priority.candidates * number)
         sample, batch = priorities.choose(priority, jax.random.fold_in(key, _CHOOSE), *candidates, number, context)
     if n_step > 1:
         batch = look_ahead(ring, sample, batch, context, n_step)

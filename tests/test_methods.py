@@ -152,8 +152,8 @@ def candidates(desired, achieved_before, number, hindsight=True):
 
 @pytest.mark.slow
 def test_the_filter_keeps_no_goal_that_was_reached_before_the_step():
-    sample, batch = candidates([0.0, 0.05, 0.5, 0.05] * 50, [0.0] * 200, 50)
-    np.testing.assert_array_equal(contributed.not_misled(sample, batch, CONTEXT)[:4], [0, 0, 1, 0])
+    sample, batch = candidates(np.repeat([0.0, 0.05, 0.05, 0.5, *[0.05] * 9], 50), [0.0] * 650, 50)
+    np.testing.assert_array_equal(contributed.not_misled(sample, batch, CONTEXT)[:200:50], [0, 0, 0, 1])
     kept = chosen(contributed.not_misleading, 0, sample, batch, 50, CONTEXT)
     np.testing.assert_allclose(kept.desired_goal[:, 0], 0.5)
     own, as_it_is = candidates([0.0] * 4, [0.0] * 4, 1, hindsight=False)
@@ -178,16 +178,39 @@ def test_td_error_ranks_episodes_and_transitions():
     ring = ring_with([[[0.05, 0.0], [0.05, 0.0]], [[0.5, 0.0], [0.5, 0.0]]], rows=3)
     renewed = jax.jit(lambda ring: priorities.renew(priorities.td_error, ring, CONTEXT))(ring)
     np.testing.assert_allclose(renewed.priority, [0.5 * 0.02, 1 - 5 * 0.02, 0.0], atol=1e-5)
-    sample, batch = candidates([0.0, 0.0, 0.0, 0.5] * 100, [0.0] * 400, 100)  # an error of 0, three times, and 0.9
-    kept = chosen(priorities.td_error, 1, sample, batch, 100, CONTEXT)
-    np.testing.assert_allclose(kept.desired_goal[:, 0], 0.5)
+    sample, batch = candidates(np.where(np.arange(13) == 5, 0.5, 0.0), np.zeros(13), 13)  # one error of 0.9, all others 0
+    kept = chosen(priorities.td_error, 1, sample, batch, 13, CONTEXT)
+    # It is the first candidate of place 5, and 1, 3 and 9 places after those of 4, 2 and 9.
+    assert np.flatnonzero(kept.desired_goal[:, 0]).tolist() == [2, 4, 5, 9]
+
+
+BY_GOAL = priorities.by_weight(lambda sample, batch, context: batch.desired_goal[:, 0])
+
+
+@pytest.mark.parametrize("number", [13, 50, 1024, 10_240])
+def test_no_two_choices_share_two_candidates_of_one_weighing(number):
+    """Each transition is a candidate of four. By the choices of a draw in which it alone has a weight."""
+    for heavy in (0, number // 2):
+        goals_ = np.where(np.arange(number) == heavy, 1.0, 0.0)
+        kept = chosen(
+            priorities.Priority(choose=BY_GOAL, candidates=1), 0, *candidates(goals_, goals_, number), number, CONTEXT
+        )
+        places = np.flatnonzero(kept.desired_goal[:, 0])
+        apart = (places[:, None] - places) % number
+        assert len(places) == 4
+        assert len(set(apart[~np.eye(4, dtype=bool)])) == 12
 
 
 def test_weights_are_kept_in_proportion():
-    choose = priorities.by_weight(lambda sample, batch, context: batch.desired_goal[:, 0])
-    sample, batch = candidates([1.0, 2.0, 0.0, 5.0] * 4000, [0.0] * 16000, 4000)
-    indices = jax.jit(lambda key, *data: choose(key, *data, 4000, CONTEXT))(jax.random.key(0), sample, batch)
-    found = np.bincount(np.asarray(indices) % 4, minlength=4)
+    """Of four candidates with weights 1, 2, 0 and 5, whose places are 0, 1, 3 and 9 thirteenths of the draw apart."""
+    starts = [round(52_000 * step / 13) for step in (0, 1, 3, 9)]
+    weights = np.zeros(52_000)
+    for start, weight in zip(starts, (1.0, 2.0, 0.0, 5.0)):
+        weights[start : start + 4000] = weight
+    sample, batch = candidates(weights, np.zeros(52_000), 52_000)
+    indices = jax.jit(lambda key, *data: BY_GOAL(key, *data, 4000, CONTEXT))(jax.random.key(0), sample, batch)
+    found = np.array([np.sum(np.asarray(indices) - start == np.arange(4000)) for start in starts])
+    assert found.sum() == 4000
     expected = 4000 * np.array([1, 2, 5]) / 8
     assert found[2] == 0
     assert np.sum((found[[0, 1, 3]] - expected) ** 2 / expected) < 13.8  # 99.9 % point at 2 degrees of freedom
@@ -195,11 +218,11 @@ def test_weights_are_kept_in_proportion():
 
 @pytest.mark.slow
 def test_half_a_batch_may_be_chosen_and_the_other_half_drawn_as_ever():
-    sample, batch = candidates([0.0, 0.0, 0.0, 1.0] * 2000, [0.5] * 8000, 2000)
+    weights = np.arange(26_000) // 2_000 == 1  # the second candidate of each place
+    sample, batch = candidates(weights.astype(float), [0.5] * 26_000, 2_000)
     half = CONTEXT._replace(hparams=HP._replace(priority_fraction=0.5))
-    by_last = priorities.Priority(choose=priorities.by_weight(lambda sample, batch, context: batch.desired_goal[:, 0]))
-    kept = chosen(by_last, 0, sample, batch, 2000, half)
-    assert abs(float(kept.desired_goal[:, 0].mean()) - 0.5) < 0.05
+    kept = chosen(priorities.Priority(choose=BY_GOAL), 0, sample, batch, 2_000, half)
+    assert abs(float(kept.desired_goal[:, 0].mean()) - (0.5 + 0.5 / 13)) < 0.05  # in 13, one first transition is a second one
 
 
 def curriculum_by_numpy(goals_, achieved, triples, weight):

@@ -22,7 +22,7 @@ from mjx_dher.contrib import generators
 from mjx_dher.contrib.generators import GenerateFn, Generator
 from mjx_dher.learners import Learner
 from mjx_dher.lookup import is_import_path
-from mjx_dher.priorities import CANDIDATES, ChooseFn, Priority, PriorityFn
+from mjx_dher.priorities import ChooseFn, Priority, PriorityFn
 from mjx_dher.relabel import relabel
 from mjx_dher.replay import ReplayState
 from mjx_dher.samplers import KernelFn, LogWeightsFn, MetricFn, NormalizationFn, Sampler
@@ -196,18 +196,18 @@ def check_priority(
         attempt("priority: renew", jax.eval_shape, lambda ring: priorities.renew(made, ring, context), trial.ring)
         lines.append(f"renewed weights {expect_range('priority: weights', weights[:EPISODES])}")
     if made.choose is not None:
-        _check_picks(made.choose, trial)
-        lines.append(f"{NUMBER} of {CANDIDATES * NUMBER} transitions chosen")
+        _check_picks(made.choose, made.candidates, trial)
+        lines.append(f"{NUMBER} of {made.candidates * NUMBER} transitions chosen")
     return f"priority as it should be: {'; '.join(lines)}"
 
 
-def _check_picks(choose: ChooseFn, trial: Trial) -> None:
+def _check_picks(choose: ChooseFn, candidates: int, trial: Trial) -> None:
     """Checks the indices from `choose` for the candidates of several batches."""
     ring, context = trial.ring, trial.context
 
     def pick(key: PRNGKey) -> jax.Array:
         sample_key, goal_key, choose_key = jax.random.split(key, 3)
-        sample = replay.sample(ring, sample_key, CANDIDATES * NUMBER)
+        sample = replay.sample(ring, sample_key, candidates * NUMBER)
         batch = relabel(sample, samplers.future, context, goal_key).batch
         indices = choose(choose_key, sample, batch, NUMBER, context)
         return check.array("priority: indices [B] of choose", indices, (NUMBER,), jnp.integer)
@@ -215,12 +215,12 @@ def _check_picks(choose: ChooseFn, trial: Trial) -> None:
     keys = jax.random.split(jax.random.key(3), BATCHES)
     program = compiled("priority: choose", pick, keys[0])
     picked = np.stack([program(key) for key in keys])
-    outside = picked[(picked < 0) | (picked >= CANDIDATES * NUMBER)]
-    expect(not outside.size, f"priority: choose gives indices of {CANDIDATES * NUMBER} candidates; one is {outside[:1]}")
+    outside = picked[(picked < 0) | (picked >= candidates * NUMBER)]
+    expect(not outside.size, f"priority: choose gives indices of {candidates * NUMBER} candidates; one is {outside[:1]}")
     same = (picked == picked[:, :1]).all()
     expect(not same, f"priority: choose must give different transitions; all {NUMBER} are one, in each of {BATCHES} batches")
-    first = (picked == CANDIDATES * np.arange(NUMBER)).all()
-    expect(not first, f"priority: choose keeps the first of each {CANDIDATES} candidates in every group; it must choose")
+    first = (picked == candidates * np.arange(NUMBER)).all()
+    expect(not first, f"priority: choose keeps the first of each {candidates} candidates in every group; it must choose")
 
 
 def check_generator(
