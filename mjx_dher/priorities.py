@@ -20,6 +20,7 @@ from mjx_dher import check, components, lookup, replay
 from mjx_dher.context import Context, one_of
 from mjx_dher.replay import ReplayState, Sample
 from mjx_dher.types import Array, Batch, Episode, PRNGKey
+from mjx_dher.validation import check_count
 
 CANDIDATES = 4  # transitions among which one is chosen
 GRAVITY = 9.81  # m/s^2
@@ -71,6 +72,7 @@ def make(name: str | Priority | PriorityFn) -> Priority | PriorityFn:
     for field, (function, parameters) in given.items():
         if function is not None:
             lookup.check_function(f"priority: {field}", function, parameters)
+    check_count("priority: candidates", value.candidates)
     if all(function is None for function, _ in given.values()):
         raise ValueError("a Priority needs weigh, renew or choose; got none of them")
     return value

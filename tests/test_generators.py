@@ -133,6 +133,7 @@ def test_what_is_half_a_priority_is_refused():
         (Priority(), "none of them"),
         (Priority(renew=lambda ring: 1.0), "renew must be a function"),
         (Priority(choose=lambda key: 1), "choose must be a function"),
+        (dataclasses.replace(priorities.td_error, candidates=0), r"priority: candidates must lie in \[1, "),
     ):
         with pytest.raises(ValueError, match=message):
             priorities.make(wrong)

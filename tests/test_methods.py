@@ -201,6 +201,22 @@ def test_no_two_choices_share_two_candidates_of_one_weighing(number):
         assert len(set(apart[~np.eye(4, dtype=bool)])) == 12
 
 
+def test_as_many_are_drawn_as_a_priority_or_the_neediest_of_several_asks_for():
+    drawn = []
+
+    def every_other(key, sample, batch, number, context):
+        drawn.append((len(sample.step), len(batch.reward), number))
+        return 2 * jnp.arange(number)
+
+    ring = ring_with([[[0.05, 0.0], [0.05, 0.0]], [[0.5, 0.0], [0.5, 0.0]]])
+    for candidates_ in (1, 4):
+        own = priorities.Priority(choose=every_other, candidates=candidates_)
+        relabel.draw_batches(ring, jax.random.key(0), (2, 3), "future", CONTEXT, replay.cumulative(ring), priority=own)
+    assert drawn == [(6, 6, 6), (24, 24, 6)]
+    joined = {name: priorities.join([priorities.td_error, name]).candidates for name in ("eventful", "energy", "curriculum")}
+    assert joined == {"eventful": 1, "energy": 1, "curriculum": 4}
+
+
 def test_weights_are_kept_in_proportion():
     """Of four candidates with weights 1, 2, 0 and 5, whose places are 0, 1, 3 and 9 thirteenths of the draw apart."""
     starts = [round(52_000 * step / 13) for step in (0, 1, 3, 9)]
