@@ -21,7 +21,7 @@ from mjx_dher.spec import RunSpec
 # With the cost of `random_of_four` and the draws of `future`.
 random_of_four = Priority(choose=priorities.by_weight(lambda sample, batch, context: jnp.ones_like(batch.reward)))
 episodes_alone = Priority(renew=priorities.td_error.renew, uses_values=True, by_part=True)
-transitions_alone = Priority(choose=priorities.td_error.choose, candidates=priorities.td_error.candidates, uses_values=True)
+transitions_alone = Priority(choose=priorities.td_error.choose, uses_values=True)  # four candidates each, as planned
 
 MORE, SLOWER = "more_updates", 1.75  # seconds of an update with `td_error` over those with `eventful`
 ARMS = (

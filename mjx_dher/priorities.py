@@ -41,7 +41,7 @@ class Priority:
     weigh: PriorityFn | None = None  # weight of an episode when it is added
     renew: RenewFn | None = None  # weights of the ring's episodes, once per cycle, before learning
     choose: ChooseFn | None = None  # choice among relabelled transitions
-    candidates: int = CANDIDATES  # transitions drawn per transition that `choose` keeps
+    candidates: int = CANDIDATES  # transitions drawn per transition that `choose` keeps. `by_weight` takes 1 or CANDIDATES
     uses_values: bool = False  # whether it reads `context.values`
     by_part: bool = False  # whether `renew` weighs each episode alone and may get part of the ring (`Config.renewals`)
     renews: Callable[[Context], Array] | None = None  # whether a lane's priority has `renew`, if lanes differ in it (`join`)
@@ -149,7 +149,7 @@ def by_weight(weigh: Callable[[Sample, Batch, Context], Array]) -> ChooseFn:
     """Makes a `choose` that keeps one of CANDIDATES transitions, in proportion to the weights [B'] from `weigh`.
 
     With `Priority.candidates` 1, each is weighed once and is a candidate of CANDIDATES choices, no two of which share another
-    (if 13 or more are drawn). So it can be kept several times in a draw, which is of many batches.
+    (if 17 or more are drawn). So it can be kept up to CANDIDATES times in a draw, which is of many batches.
 
     A weight that is not positive and finite counts as 0. If all candidates have weight 0, the choice is uniform. Raises
     ValueError unless `weigh` returns one weight per transition.
@@ -158,9 +158,11 @@ def by_weight(weigh: Callable[[Sample, Batch, Context], Array]) -> ChooseFn:
     def choose(key: PRNGKey, sample: Sample, batch: Batch, number: int, context: Context) -> Array:
         weight = weigh(sample, batch, context)
         weight = check.array("priority: weights [B] of transitions", weight, batch.reward.shape, jnp.number)
-        # The differences of 0, 1, 3 and 9 modulo 13 are all different.
-        apart = jnp.asarray([step * max(len(weight), 13) // 13 for step in (0, 1, 3, 9)], jnp.int32)
-        groups = (jnp.arange(number, dtype=jnp.int32)[:, None] + apart) % len(weight)
+        places = jnp.arange(number, dtype=jnp.int32)[:, None]
+        groups = CANDIDATES * places + jnp.arange(CANDIDATES, dtype=jnp.int32)
+        if len(weight) < CANDIDATES * number:  # they share: the differences of 0, 1, 3 and 9 modulo 13 are all different
+            apart = [step * max(len(weight), 13) // 13 for step in (0, 1, 3, 9)]
+            groups = (places + jnp.asarray(apart, jnp.int32)) % len(weight)
         weight = replay.as_priority(weight)[groups]
         weight = weight * replay.sum_factor(weight)
         total = jnp.cumsum(jnp.where(jnp.sum(weight, axis=1, keepdims=True) > 0, weight, 1.0), axis=1)
@@ -201,6 +203,8 @@ def _choose(priority: Priority, key: PRNGKey, sample: Sample, batch: Batch, numb
     """Indices [number] of the candidates to keep, int32. Without `choose`, they are the first of each group."""
     if priority.choose is None:
         return len(batch.reward) // number * jnp.arange(number, dtype=jnp.int32)
+    # Another lane's priority may need more.
+    sample, batch = jax.tree.map(lambda x: x[: priority.candidates * number], (sample, batch))
     indices = priority.choose(key, sample, batch, number, context)
     return check.array("priority: indices [B] of choose", indices, (number,), jnp.integer).astype(jnp.int32)
 

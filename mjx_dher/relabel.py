@@ -147,7 +147,7 @@ def draw_batches(
       context: reward function and numbers. Its `hparams.priority_fraction` is the fraction drawn by priority.
       weights: `replay.cumulative(ring)`.
       n_step: steps of a return (`look_ahead`).
-      priority: priority. If it chooses among transitions, several candidates are drawn for each.
+      priority: priority. If it chooses among transitions, `priority.candidates` are drawn for each.
     """
     check_count("n_step", n_step)
     number, sampler = math.prod(shape), samplers.make(sampler)

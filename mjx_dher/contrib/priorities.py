@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_dher.context import Context
-from mjx_dher.priorities import CANDIDATES, ChooseFn, Priority, by_weight
+from mjx_dher.priorities import ChooseFn, Priority, by_weight
 from mjx_dher.replay import ReplayState, Sample
 from mjx_dher.types import Array, Batch, Episode, PRNGKey
 
@@ -96,14 +96,14 @@ max_entropy = Priority(renew=_by_rarity)
 
 
 def _in_groups(pick: GroupFn, size: int) -> ChooseFn:
-    """Makes a `choose` that keeps `size` of each group of CANDIDATES * `size` transitions by `pick`.
+    """Makes a `choose` that keeps `size` of each group of `Priority.candidates` * `size` transitions by `pick`.
 
     If `size` does not divide the number of transitions, groups are smaller.
     """
 
     def choose(key: PRNGKey, sample: Sample, batch: Batch, number: int, context: Context) -> Array:
         kept = math.gcd(number, size)
-        groups, together = number // kept, kept * CANDIDATES
+        groups, together = number // kept, kept * (len(batch.reward) // number)
         parts = jax.tree.map(lambda x: x.reshape(groups, together, *x.shape[1:]), (sample, batch))
         keys = jax.random.split(key, groups)
         indices = jax.vmap(lambda key, sample, batch: pick(key, sample, batch, kept, context))(keys, *parts)
