@@ -1,6 +1,5 @@
 """The published methods, beside numbers by hand."""
 
-import dataclasses
 import functools
 import itertools
 import math
@@ -17,7 +16,6 @@ from mjx_dher.context import Context, Values
 from mjx_dher.contrib import goals, metrics
 from mjx_dher.contrib import priorities as contributed
 from mjx_dher.replay import Sample
-from mjx_dher.runs.program import Lane
 from mjx_dher.types import Batch, Episode
 from probes import Clock
 
@@ -184,63 +182,6 @@ def test_td_error_ranks_episodes_and_transitions():
     kept = chosen(priorities.td_error, 1, sample, batch, 13, CONTEXT)
     # It is the first candidate of place 5, and 1, 3 and 9 places after those of 4, 2 and 9.
     assert np.flatnonzero(kept.desired_goal[:, 0]).tolist() == [2, 4, 5, 9]
-
-
-BY_GOAL = priorities.by_weight(lambda sample, batch, context: batch.desired_goal[:, 0])
-
-
-@pytest.mark.parametrize("number", [13, 17, 18, 50, 1024, 10_240])
-def test_no_two_choices_share_two_candidates_of_one_weighing(number):
-    """Each transition is a candidate of four. By the choices of a draw in which it alone has a weight."""
-    for heavy in (0, number // 2):
-        goals_ = np.where(np.arange(number) == heavy, 1.0, 0.0)
-        kept = chosen(
-            priorities.Priority(choose=BY_GOAL, candidates=1), 0, *candidates(goals_, goals_, number), number, CONTEXT
-        )
-        places = np.flatnonzero(kept.desired_goal[:, 0])
-        apart = (places[:, None] - places) % number
-        assert len(places) == 4
-        assert len(set(apart[~np.eye(4, dtype=bool)])) == 12
-
-
-def test_as_many_are_drawn_as_a_priority_or_the_neediest_of_several_asks_for():
-    drawn = []
-
-    def every_other(key, sample, batch, number, context):
-        drawn.append((len(sample.step), len(batch.reward), number))
-        return 2 * jnp.arange(number)
-
-    ring = ring_with([[[0.05, 0.0], [0.05, 0.0]], [[0.5, 0.0], [0.5, 0.0]]])
-    for candidates_ in (1, 4):
-        own = priorities.Priority(choose=every_other, candidates=candidates_)
-        relabel.draw_batches(ring, jax.random.key(0), (2, 3), "future", CONTEXT, replay.cumulative(ring), priority=own)
-    assert drawn == [(6, 6, 6), (24, 24, 6)]
-    drawn.clear()  # of several, each gets as many as it asks for
-    joined = priorities.join([dataclasses.replace(own, candidates=2), contributed.curriculum])
-    for lane in (0, 1):
-        hparams = Lane(*HP, choice=0, priority_choice=lane, generator_choice=0)
-        context = CONTEXT._replace(hparams=hparams)
-        relabel.draw_batches(ring, jax.random.key(0), (6,), "future", context, replay.cumulative(ring), priority=joined)
-    assert set(drawn) == {(12, 12, 6)}
-    joined = {name: priorities.join([priorities.td_error, name]).candidates for name in ("eventful", "energy", "curriculum")}
-    assert joined == {"eventful": 1, "energy": 1, "curriculum": 4}
-
-
-def test_weights_are_kept_in_proportion():
-    sample, batch = candidates([1.0, 2.0, 0.0, 5.0] * 4000, [0.0] * 16000, 4000)
-    indices = jax.jit(lambda key, *data: BY_GOAL(key, *data, 4000, CONTEXT))(jax.random.key(0), sample, batch)
-    found = np.bincount(np.asarray(indices) % 4, minlength=4)
-    expected = 4000 * np.array([1, 2, 5]) / 8
-    assert found[2] == 0
-    assert np.sum((found[[0, 1, 3]] - expected) ** 2 / expected) < 13.8  # 99.9 % point at 2 degrees of freedom
-
-
-@pytest.mark.slow
-def test_half_a_batch_may_be_chosen_and_the_other_half_drawn_as_ever():
-    sample, batch = candidates([0.0, 0.0, 0.0, 1.0] * 2000, [0.5] * 8000, 2000)
-    half = CONTEXT._replace(hparams=HP._replace(priority_fraction=0.5))
-    kept = chosen(priorities.Priority(choose=BY_GOAL), 0, sample, batch, 2000, half)
-    assert abs(float(kept.desired_goal[:, 0].mean()) - 0.5) < 0.05
 
 
 def curriculum_by_numpy(goals_, achieved, triples, weight):
