@@ -159,10 +159,10 @@ def by_weight(weigh: Callable[[Sample, Batch, Context], Array]) -> ChooseFn:
         weight = weigh(sample, batch, context)
         weight = check.array("priority: weights [B] of transitions", weight, batch.reward.shape, jnp.number)
         places = jnp.arange(number, dtype=jnp.int32)[:, None]
-        groups = CANDIDATES * places + jnp.arange(CANDIDATES, dtype=jnp.int32)
+        groups = CANDIDATES * places + jnp.arange(CANDIDATES, dtype=jnp.int32)[None]
         if len(weight) < CANDIDATES * number:  # they share: the differences of 0, 1, 3 and 9 modulo 13 are all different
             apart = [step * max(len(weight), 13) // 13 for step in (0, 1, 3, 9)]
-            groups = (places + jnp.asarray(apart, jnp.int32)) % len(weight)
+            groups = (places + jnp.asarray([apart], jnp.int32)) % len(weight)
         weight = replay.as_priority(weight)[groups]
         weight = weight * replay.sum_factor(weight)
         total = jnp.cumsum(jnp.where(jnp.sum(weight, axis=1, keepdims=True) > 0, weight, 1.0), axis=1)

@@ -114,7 +114,10 @@ MORE = {  # what a check is handed, and a word of what it says
         lambda: check_priority(always(lambda i, key: 0 * i + jax.random.randint(key, (), 0, 32)), TRIAL),
         "all 8 are one",
     ),
-    "the first of each": (lambda: check_priority(always(lambda i, key: 4 * i), TRIAL), "keeps the first of each 4"),
+    "the first of each": (
+        lambda: check_priority(always(lambda i, key: 4 * i), TRIAL),
+        "keeps the first candidate of every place",
+    ),
     "no candidate": (
         lambda: check_priority(always(lambda i, key: 5 * i - 1), TRIAL),
         r"indices of 32 candidates; one is \[-1\]",
