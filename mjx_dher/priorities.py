@@ -140,7 +140,7 @@ def choose(
     choose_key, coin_key = jax.random.split(key)
     indices = _choose(priority, choose_key, sample, batch, number, context)
     coin = jax.random.uniform(coin_key, (number,), jnp.float32) < context.hparams.priority_fraction
-    first = len(batch.reward) // number * jnp.arange(number, dtype=jnp.int32)
+    first = _choose(Priority(), choose_key, sample, batch, number, context)
     kept = jnp.where(coin, jnp.clip(indices, 0, len(batch.reward) - 1), first)
     return jax.tree.map(lambda x: x[kept], (sample, batch))
 

@@ -237,3 +237,14 @@ def test_what_the_pages_say_of_modern_critics():
     assert "loses {:.3f}](experiments/ablation.md#modern-critics) ({:.3f} to {:.3f}, ten pairs)".format(*block) in helps
     for arm in ("residual", "unit_norm", "categorical", "categorical_unit_norm", "resets"):
         assert max(paired("modern_critics_runs.csv", task, arm, "preset")[2] for task in ("slide", "block_rotate_z")) < 0
+
+
+def test_no_smaller_network_replaced_that_of_push():
+    """Of the table of successes by seed: means, Student's intervals of the paired differences, and the plan's bound."""
+    section = (ROOT / "docs" / "experiments" / "preset_gpu.md").read_text().split("### Push")[1].split("\n## ")[0]
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in section.splitlines() if line.count(", ") > 9]
+    base, *smaller = (np.array(row[1].split(", "), float) for row in rows)
+    assert [len(smaller), *map(len, smaller)] == [5] + [10] * 5
+    assert [row[2] for row in rows] == [f"{each.mean():.3f}" for each in (base, *smaller)]
+    assert [row[3] for row in rows] == ["", *("{:+.3f} ({:.3f} to {:.3f})".format(*interval(each - base)) for each in smaller)]
+    assert max((each - base).mean() for each in smaller) < -0.005

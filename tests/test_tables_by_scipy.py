@@ -288,7 +288,7 @@ def test_what_mirror_images_gain_on_a_gpu():
     page = " ".join((ROOT / "docs" / "experiments" / "preset_mirror.md").read_text().split())
     arrays = {}
     for of, name in MIRROR_RUNS.items():
-        seeds = range(of[3], of[3] + (40 if of[1::2] == ("slide", 710) else 20))
+        seeds = range(of[3], of[3] + (40 if (of[1], of[3]) == ("slide", 710) else 20))
         assert all(list(by_seed) == list(seeds) for by_seed in runs[of].values())
         plain, mirror = (np.array(list(runs[of][setting].values())).T for setting in ("plain", "mirror"))
         arrays[of] = plain, mirror
