@@ -106,6 +106,9 @@ _TABLE = {
         "td_error": Component(
             "priorities", "episodes and relabelled transitions by their one-step errors (HGR)", ("renewals",), "transitions"
         ),
+        "td_error_shared": Component(
+            "priorities", "the same in less time: four places share each candidate's error", ("renewals",), "transitions"
+        ),
         "curriculum": Component(
             "contrib.priorities", "transitions with diverse goals at first, near goals later (CHER)", group="transitions"
         ),

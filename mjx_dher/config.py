@@ -86,7 +86,7 @@ class Config:
     """Rewards in a return before it bootstraps from the critic, at most an episode's."""
     renewals: Annotated[int, Number("[0, 1000000]")] = 0
     """Priorities renewed per cycle and new episode: the new episodes first, then random ones. 0 renews the whole ring. Read by
-    renewable priorities that weigh each episode alone: of the built-in ones, td_error."""
+    renewable priorities that weigh each episode alone: of the built-in ones, td_error and td_error_shared."""
     augmentation: Literal["none", "mirror"] = "none"
     """mirror replaces a random half of each batch by mirror images. The task needs the method mirror."""
     eval_episodes: Count = 100

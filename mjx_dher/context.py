@@ -7,11 +7,14 @@ with the current learner.
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from mjx_dher.config import HParams
 from mjx_dher.contract import STEP_SECONDS, step_seconds
 from mjx_dher.types import Array, Batch, DistanceFn, PyTree, ReachedFn, RewardFn
+
+_ERRORS_AT_ONCE = 2048  # on a CPU, whose cache they fit: two thirds of the time of all at once
 
 
 def euclidean(achieved: Array, desired: Array) -> Array:
@@ -71,6 +74,8 @@ class Context(NamedTuple):
 
     def td_error(self, batch: Batch) -> Array:
         """One-step errors r + discount V(s', g) - Q(s, a, g) of a batch, shape [B]."""
+        if batch.reward.size > _ERRORS_AT_ONCE and jax.default_backend() == "cpu":
+            return jax.lax.map(self.td_error, batch, batch_size=_ERRORS_AT_ONCE)
         values = self.learner_values()
         following = values.of_state(batch.next_observation, batch.desired_goal)
         target = jnp.clip(batch.reward + batch.discount * following, *self.bounds())

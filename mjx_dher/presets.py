@@ -114,7 +114,7 @@ def _frugal(env: str) -> RunSpec:
     base = _cpu(env)
     if env == "reach":
         return base.replace(updates_per_cycle=80, total_steps=8_000)
-    steps = {"push": 160_000, "pick_and_place": 500_000, "slide": 1_000_000}.get(env, base.config.total_steps)
+    steps = {"push": 112_000, "pick_and_place": 500_000, "slide": 1_000_000}.get(env, base.config.total_steps)
     return base.replace(cycles_per_epoch=5, updates_per_cycle=200, total_steps=steps)
 
 
@@ -192,7 +192,7 @@ _LEARNERS = {  # by preset, and environment or robot
     ),
     ("cpu", "push"): _Best("td3", "mlp", _cpu_push, {"augmentation": "mirror"}),
     ("cpu", "pick_and_place"): _PICK_AND_PLACE,
-    ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error", "augmentation": "mirror"}),
+    ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error_shared", "augmentation": "mirror"}),
     ("gpu", "push"): _Best("ddpg", "mlp", None, {"augmentation": "mirror"}),
     ("gpu", "hand_reach"): _Best("ddpg", "mlp", _gpu_hand_reach),
     ("gpu", "pick_and_place"): _PICK_AND_PLACE,

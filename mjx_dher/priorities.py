@@ -262,7 +262,7 @@ def _mean_error(ring: ReplayState, context: Context) -> Array:
 td_error = Priority(
     renew=_mean_error,
     choose=by_weight(lambda sample, batch, context: jnp.abs(context.td_error(batch))),
-    candidates=1,
     uses_values=True,
     by_part=True,
 )
+td_error_shared = dataclasses.replace(td_error, candidates=1)  # a quarter of the errors: less time, and less gained per step

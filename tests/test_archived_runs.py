@@ -1,7 +1,6 @@
 """Runs and a sweep that commit 070bb8d wrote: they are read, resumed and evaluated as they were there."""
 
 import csv
-import dataclasses
 import json
 import shutil
 import sys
@@ -12,7 +11,7 @@ import pytest
 from conftest import ROOT, refuses
 
 import mjx_dher
-from mjx_dher import cli, priorities
+from mjx_dher import cli
 from mjx_dher.runs.folder import reading, results
 from mjx_dher.sweeps import grid, tables
 
@@ -68,9 +67,7 @@ def test_an_evaluation_gives_the_same_numbers(archive, capsys):
 
 
 @pytest.mark.parametrize("name", ["tqc", pytest.param("ddpg", marks=pytest.mark.slow)])
-def test_a_stopped_run_resumes(archive, name, monkeypatch):
-    # The code of then drew four candidates for each place of `td_error`, which `tqc` has.
-    monkeypatch.setattr(priorities, "td_error", dataclasses.replace(priorities.td_error, candidates=4))
+def test_a_stopped_run_resumes(archive, name):
     folder = archive / f"{name}_stopped"
     assert reading.read_spec(folder) == made.RUNS[name]
     assert cli.main(["resume", str(folder), "--no-curve"]) == 0

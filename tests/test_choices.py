@@ -48,7 +48,7 @@ def test_as_many_are_drawn_as_a_priority_or_the_neediest_of_several_asks_for():
         context = CONTEXT._replace(hparams=hparams)
         relabel.draw_batches(ring, jax.random.key(0), (6,), "future", context, replay.cumulative(ring), priority=joined)
     assert set(drawn) == {(12, 12, 6)}
-    joined = {name: priorities.join([priorities.td_error, name]).candidates for name in ("eventful", "energy", "curriculum")}
+    joined = {name: priorities.join(["td_error_shared", name]).candidates for name in ("eventful", "energy", "curriculum")}
     assert joined == {"eventful": 1, "energy": 1, "curriculum": 4}
 
 

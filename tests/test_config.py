@@ -64,7 +64,8 @@ def test_a_preset_has_a_priority_of_its_own_where_its_learner_is_taken():
     assert presets.preset("cpu", "pick_and_place", priority="td_error") == dataclasses.replace(own, priority="td_error")
     assert presets.preset("cpu", "pick_and_place", learner="ddpg").priority == "eventful"
     assert presets.preset("cpu", "push").priority == "eventful"
-    assert [presets.preset(name, "slide").priority for name in ("cpu", "gpu", "frugal")] == ["td_error"] * 3
+    of_slide = [presets.preset(name, "slide").priority for name in ("cpu", "gpu", "frugal")]
+    assert of_slide == ["td_error_shared", "td_error", "td_error"]
     assert presets.preset("gpu", "slide", learner="td3").priority == "eventful"
 
 

@@ -136,12 +136,14 @@ def test_judges_of_actions():
     np.testing.assert_array_equal(parts.judges(params)["w"], [[0.0, 1.0]])
 
 
-def test_critics_begin_apart_and_are_each_that_critic_alone():
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])  # one after the other, or together
+def test_critics_begin_apart_and_are_each_that_critic_alone(backend, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
     network = Critic((16,), size=4)
     made = Critics(3, 4, critics.smallest, critics.squared_error, critics.mean)
     params = jax.jit(lambda: made.init(network, KEY, *map(jnp.zeros, (5, 3, 2))))()
     inputs = [jax.random.normal(jax.random.key(i), (7, size)) for i, size in enumerate((5, 3, 2))]
-    values = np.asarray(jax.jit(critics.values, static_argnums=0)(network, params, *inputs))
+    values = np.asarray(jax.jit(lambda *inputs: critics.values(network, *inputs))(params, *inputs))
     assert values.shape == (3, 7, 4)
     assert not np.allclose(values[0], values[1])
     params, apply = jax.device_get(params), jax.jit(network.apply)

@@ -174,12 +174,25 @@ def test_errors_of_one_step_by_hand():
     del sample
 
 
+@pytest.mark.parametrize(("backend", "number", "parts"), [("cpu", 4099, [2048]), ("cpu", 2048, []), ("gpu", 4099, [])])
+def test_a_cpu_computes_errors_of_a_large_batch_in_parts(backend, number, parts, monkeypatch):
+    sizes, whole = [], jax.lax.map
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(
+        jax.lax, "map", lambda *inputs, batch_size: sizes.append(batch_size) or whole(*inputs, batch_size=batch_size)
+    )
+    _, batch = candidates(np.linspace(0.2, 1.0, number), np.zeros(number), number)
+    errors = CONTEXT.td_error(batch)
+    assert sizes == parts
+    np.testing.assert_allclose(errors, -1 + 0.02 * 10 * np.linspace(0.2, 1.0, number), atol=1e-5)
+
+
 def test_td_error_ranks_episodes_and_transitions():
     ring = ring_with([[[0.05, 0.0], [0.05, 0.0]], [[0.5, 0.0], [0.5, 0.0]]], rows=3)
     renewed = jax.jit(lambda ring: priorities.renew(priorities.td_error, ring, CONTEXT))(ring)
     np.testing.assert_allclose(renewed.priority, [0.5 * 0.02, 1 - 5 * 0.02, 0.0], atol=1e-5)
     sample, batch = candidates(np.where(np.arange(13) == 5, 0.5, 0.0), np.zeros(13), 13)  # one error of 0.9, all others 0
-    kept = chosen(priorities.td_error, 1, sample, batch, 13, CONTEXT)
+    kept = chosen(priorities.td_error_shared, 1, sample, batch, 13, CONTEXT)
     # It is the first candidate of place 5, and 1, 3 and 9 places after those of 4, 2 and 9.
     assert np.flatnonzero(kept.desired_goal[:, 0]).tolist() == [2, 4, 5, 9]
 

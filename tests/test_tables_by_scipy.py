@@ -220,24 +220,6 @@ def with_interval(gains, form="{:+.3f} ({:.3f} to {:.3f})"):
     return form.format(*interval(gains))
 
 
-def test_the_candidate_of_slide_passed():
-    """Means, spreads and Student's intervals of the third stage, as preset_screen.md has them."""
-    with (ROOT / "docs" / "preset_screen_slide_runs.csv").open() as file:
-        rows = [
-            (row["setting"], int(row["seed"]), float(row["late_success"]), float(row["final"])) for row in csv.DictReader(file)
-        ]
-    assert [row[:2] for row in rows] == [(name, seed) for name in ("preset", "candidate") for seed in range(670, 690)]
-    late, final = (np.array([row[column] for row in rows]).reshape(2, 20) for column in (2, 3))
-    page = " ".join((ROOT / "docs" / "experiments" / "preset_screen.md").read_text().split())
-    for a, b in zip(late, final):
-        assert f"| {a.mean():.3f} | {b.mean():.3f} ({b.min():.3f} to {b.max():.3f}) | {b.std(ddof=1):.3f} |" in page
-    gains = [with_interval(candidate - preset) for preset, candidate in (late, final)]
-    assert f"| {gains[0]} | {gains[1]} |" in page
-    assert f"in {(late[1] > late[0]).sum()} of 20 pairs" in page
-    falls = [f"{np.median(each) - each.min():.3f}" for each in final[::-1]]
-    assert "{} below the median, the former preset's {}.".format(*falls) in page
-
-
 def test_what_mirror_images_gain():
     """Of both trials: means, and Student's intervals of the paired differences."""
     page = (ROOT / "docs" / "experiments" / "preset_mirror.md").read_text()
@@ -278,6 +260,8 @@ def test_what_mirror_images_gain_on_a_gpu():
             if (row["task"], row["setting"]) == ("slide", "plain") and row["native"]:
                 native.append((float(row["final"]), float(row["native"])))
             first = 690 if int(row["seed"]) < 710 else 710
+            if row["setting"] == "shared" or row["env_steps"] in ("112000", "96000"):  # test_preset_trials.py
+                continue
             of = runs.setdefault((row["preset"], row["task"], int(row["env_steps"]), first), {"plain": {}, "mirror": {}})
             measure = row["late_success" if row["task"] == "slide" else "mean_success"]
             of[row["setting"]][int(row["seed"])] = float(measure), float(row["final"]), float(row["steps_to_0.9"])

@@ -1,0 +1,70 @@
+"""What the pages say of trials of presets, recomputed from their runs by scipy."""
+
+import csv
+
+import numpy as np
+from conftest import ROOT
+from test_tables_by_scipy import with_interval
+
+
+def runs(preset, task, setting, env_steps, first):
+    """Columns late success and last success of the runs of seeds from `first` on, in order of seeds."""
+    with (ROOT / "docs" / "preset_mirror_runs.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if int(row["seed"]) >= first]
+    of = [row for row in rows if [*row.values()][:4] == [preset, task, setting, str(env_steps)]]
+    assert [int(row["seed"]) for row in of] == list(range(first, first + len(of)))
+    assert len(of) == {"push": 20, "slide": 40}[task]
+    return np.array([(float(row["late_success"]), float(row["final"])) for row in of]).T
+
+
+def page(name):
+    return " ".join((ROOT / "docs" / "experiments" / f"{name}.md").read_text().split())
+
+
+def test_push_learns_in_fewer_steps():
+    long, images = (runs("frugal", "push", setting, 160_000, 710)[1] for setting in ("plain", "mirror"))
+    below = {}
+    for steps in (112_000, 96_000):
+        last = runs("frugal", "push", "mirror", steps, 710)[1]
+        below[steps] = np.median(last) - last.min()
+        numbers = f"{last.mean():.3f} | {with_interval(last - long)} | {last.min():.3f} | {below[steps]:.3f}"
+        assert f"| {steps:,} | {numbers} |" in page("preset_mirror")
+        assert np.mean(last - long) > -0.01
+    assert below[112_000] < 0.05 < below[96_000]
+    less = with_interval(images - runs("frugal", "push", "mirror", 112_000, 710)[1], "{:.3f} ({:.3f} to {:.3f})")
+    assert f"That is {less} less than after 160,000 with images" in page("preset_mirror")
+
+
+def test_a_shorter_slide_ends_lower():
+    plain, short = runs("cpu", "slide", "plain", 1_280_000, 710)[1], runs("cpu", "slide", "shared", 1_024_000, 710)[1]
+    lower = with_interval(plain - short, "{:.3f} ({:.3f} to {:.3f})")
+    assert f"the last success is {short.mean():.3f}, {lower} lower than without images" in page("preset_mirror")
+
+
+def test_shared_candidates_cost_success():
+    shared = runs("cpu", "slide", "shared", 1_280_000, 710)
+    for setting, words in (("mirror", "`td_error`"), ("plain", "`td_error`, without mirror images")):
+        other = runs("cpu", "slide", setting, 1_280_000, 710)
+        form = "{:+.3f} ({:+.3f} to {:+.3f})"
+        measure, last = (with_interval(gain, form) for gain in shared - other)
+        row = f"| {words} | {measure} | {(shared[0] > other[0]).sum()} of 40 | {last} |"
+        assert row in page("bakeoff_repeats")
+    assert f"It ends at {shared[1].mean():.3f}." in page("bakeoff_repeats")
+
+
+def test_the_candidate_of_slide_passed():
+    """Means, spreads and Student's intervals of the third stage, as preset_screen.md has them."""
+    with (ROOT / "docs" / "preset_screen_slide_runs.csv").open() as file:
+        rows = [
+            (row["setting"], int(row["seed"]), float(row["late_success"]), float(row["final"])) for row in csv.DictReader(file)
+        ]
+    assert [row[:2] for row in rows] == [(name, seed) for name in ("preset", "candidate") for seed in range(670, 690)]
+    late, final = (np.array([row[column] for row in rows]).reshape(2, 20) for column in (2, 3))
+    page = " ".join((ROOT / "docs" / "experiments" / "preset_screen.md").read_text().split())
+    for a, b in zip(late, final):
+        assert f"| {a.mean():.3f} | {b.mean():.3f} ({b.min():.3f} to {b.max():.3f}) | {b.std(ddof=1):.3f} |" in page
+    gains = [with_interval(candidate - preset) for preset, candidate in (late, final)]
+    assert f"| {gains[0]} | {gains[1]} |" in page
+    assert f"in {(late[1] > late[0]).sum()} of 20 pairs" in page
+    falls = [f"{np.median(each) - each.min():.3f}" for each in final[::-1]]
+    assert "{} below the median, the former preset's {}.".format(*falls) in page
