@@ -216,7 +216,7 @@ def test_the_table_of_unseen_seeds_is_of_the_file():
     }
     assert shown.keys() == finals.keys()
     for of, values in finals.items():
-        assert len(values) == (3 if of == ("cpu", "slide") else 10)
+        assert len(values) == (6 if of == ("cpu", "slide") else 10)
         error = max(scipy.stats.sem(values), 1e-9)  # all can be 1
         low, high = scipy.stats.t.interval(0.95, len(values) - 1, np.mean(values), error)
         numbers = (min(values), np.median(values), max(values), np.mean(values), low, min(high, 1.0))

@@ -8,13 +8,13 @@ from test_tables_by_scipy import with_interval
 
 
 def runs(preset, task, setting, env_steps, first):
-    """Columns late success and last success of the runs of seeds from `first` on, in order of seeds."""
+    """Late success, last success and steps to 0.90 of the runs of seeds from `first` on."""
     with (ROOT / "docs" / "preset_mirror_runs.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if int(row["seed"]) >= first]
     of = [row for row in rows if [*row.values()][:4] == [preset, task, setting, str(env_steps)]]
     assert [int(row["seed"]) for row in of] == list(range(first, first + len(of)))
     assert len(of) == {"push": 20, "slide": 40}[task]
-    return np.array([(float(row["late_success"]), float(row["final"])) for row in of]).T
+    return np.array([[float(row[name]) for name in ("late_success", "final", "steps_to_0.9")] for row in of]).T
 
 
 def page(name):
@@ -31,6 +31,8 @@ def test_push_learns_in_fewer_steps():
         assert f"| {steps:,} | {numbers} |" in page("preset_mirror")
         assert np.mean(last - long) > -0.01
     assert below[112_000] < 0.05 < below[96_000]
+    median = np.median(runs("frugal", "push", "mirror", 112_000, 710)[2])
+    assert f"takes Push to 0.90 in {median:,.0f} steps" in (ROOT / "docs" / "real_robot.md").read_text()
     less = with_interval(images - runs("frugal", "push", "mirror", 112_000, 710)[1], "{:.3f} ({:.3f} to {:.3f})")
     assert f"That is {less} less than after 160,000 with images" in page("preset_mirror")
 
@@ -46,10 +48,16 @@ def test_shared_candidates_cost_success():
     for setting, words in (("mirror", "`td_error`"), ("plain", "`td_error`, without mirror images")):
         other = runs("cpu", "slide", setting, 1_280_000, 710)
         form = "{:+.3f} ({:+.3f} to {:+.3f})"
-        measure, last = (with_interval(gain, form) for gain in shared - other)
+        measure, last = (with_interval(gain, form) for gain in shared[:2] - other[:2])
         row = f"| {words} | {measure} | {(shared[0] > other[0]).sum()} of 40 | {last} |"
         assert row in page("bakeoff_repeats")
     assert f"It ends at {shared[1].mean():.3f}." in page("bakeoff_repeats")
+    with (ROOT / "docs" / "unseen_runs.csv").open() as file:
+        here = [float(row["final"]) for row in csv.DictReader(file) if (row["learner"], row["task"]) == ("cpu", "slide")]
+    ends = f"six seeds end at {np.mean(here):.3f} on `native` and [forty others](bakeoff_repeats.md#cost-of-td_error) at"
+    assert f"{ends} {shared[1].mean():.3f} on `warp`" in page("preset_screen")
+    below = [np.median(last) - np.min(last) for last in (shared[1], here)]
+    assert "it is {:.3f}, and {:.3f} on the six seeds of two cores".format(*below) in page("presets")
 
 
 def test_the_candidate_of_slide_passed():
