@@ -6,6 +6,8 @@ import numpy as np
 from conftest import ROOT
 from test_tables_by_scipy import with_interval
 
+from mjx_dher import presets
+
 
 def runs(preset, task, setting, env_steps, first):
     """Late success, last success and steps to 0.90 of the runs of seeds from `first` on."""
@@ -31,6 +33,7 @@ def test_push_learns_in_fewer_steps():
         assert f"| {steps:,} | {numbers} |" in page("preset_mirror")
         assert np.mean(last - long) > -0.01
     assert below[112_000] < 0.05 < below[96_000]
+    assert presets.preset("frugal", "push").config.total_steps == 112_000
     median = np.median(runs("frugal", "push", "mirror", 112_000, 710)[2])
     assert f"takes Push to 0.90 in {median:,.0f} steps" in (ROOT / "docs" / "real_robot.md").read_text()
     less = with_interval(images - runs("frugal", "push", "mirror", 112_000, 710)[1], "{:.3f} ({:.3f} to {:.3f})")
