@@ -71,11 +71,11 @@ def test_the_candidate_of_slide_passed():
         ]
     assert [row[:2] for row in rows] == [(name, seed) for name in ("preset", "candidate") for seed in range(670, 690)]
     late, final = (np.array([row[column] for row in rows]).reshape(2, 20) for column in (2, 3))
-    page = " ".join((ROOT / "docs" / "experiments" / "preset_screen.md").read_text().split())
+    screen = page("preset_screen")
     for a, b in zip(late, final):
-        assert f"| {a.mean():.3f} | {b.mean():.3f} ({b.min():.3f} to {b.max():.3f}) | {b.std(ddof=1):.3f} |" in page
+        assert f"| {a.mean():.3f} | {b.mean():.3f} ({b.min():.3f} to {b.max():.3f}) | {b.std(ddof=1):.3f} |" in screen
     gains = [with_interval(candidate - preset) for preset, candidate in (late, final)]
-    assert f"| {gains[0]} | {gains[1]} |" in page
-    assert f"in {(late[1] > late[0]).sum()} of 20 pairs" in page
+    assert f"| {gains[0]} | {gains[1]} |" in screen
+    assert f"in {(late[1] > late[0]).sum()} of 20 pairs" in screen
     falls = [f"{np.median(each) - each.min():.3f}" for each in final[::-1]]
-    assert "{} below the median, the former preset's {}.".format(*falls) in page
+    assert "{} below the median, the former preset's {}.".format(*falls) in screen
