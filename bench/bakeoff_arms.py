@@ -200,7 +200,7 @@ def parts_of(task: str, arm: Arm) -> dict[str, str]:
 
 _AS_OF: dict[str, dict[str, Any]] = {  # 2026-11-25, the hand 2026-11-27
     "push": {"augmentation": "none"},
-    "pick_and_place": {"num_envs": 512, "replay_size": 4_000_000},
+    "pick_and_place": {"num_envs": 512, "replay_size": 4_000_000, "augmentation": "none"},
     "slide": {"policy_delay": 1, "renewals": 0, "learner_dtype": "float32"},
     "block_rotate_z": {"her_k": 4.0},
 }

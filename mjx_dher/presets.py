@@ -198,7 +198,9 @@ _LEARNERS = {  # by preset, and environment or robot
     ("gpu", "pick_and_place"): _PICK_AND_PLACE,
     ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide, {"priority": "td_error"}),
     ("frugal", "push"): _Best("td3", "mlp", lambda env: _frugal(env).replace(noise_std=0.6), {"augmentation": "mirror"}),
-    ("frugal", "pick_and_place"): _Best("tqc", "layer_norm", lambda env: _kept(_entropy(env), 500_000, num_envs=64)),
+    ("frugal", "pick_and_place"): _Best(
+        "tqc", "layer_norm", lambda env: _kept(_entropy(env), 320_000, num_envs=64), {"augmentation": "mirror"}
+    ),
     ("frugal", "slide"): _Best(
         "dtqc", "layer_norm", lambda env: _small(_frugal(env), updates_per_cycle=150, n_step=3), {"priority": "td_error"}
     ),

@@ -197,6 +197,7 @@ FIRST_UNSEEN = {  # where not 600: the preset had changed since
     ("cpu", "pick_and_place"): 620,
     ("cpu", "slide"): 620,
     ("gpu", "push"): 750,
+    ("frugal", "push"): 620,
     ("gpu", "pick_and_place"): 620,
     **{("gpu", name): 620 for name in ("egg_rotate", "block_rotate_z", "block_rotate_parallel", "block_rotate_xyz")},
 }

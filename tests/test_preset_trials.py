@@ -15,7 +15,7 @@ def runs(preset, task, setting, env_steps, first):
         rows = [row for row in csv.DictReader(file) if int(row["seed"]) >= first]
     of = [row for row in rows if [*row.values()][:4] == [preset, task, setting, str(env_steps)]]
     assert [int(row["seed"]) for row in of] == list(range(first, first + len(of)))
-    assert len(of) == {"push": 20, "slide": 40}[task]
+    assert len(of) == {"push": 20, "pick_and_place": 8, "slide": 10 if setting.endswith("again") else 40}[task]
     return np.array([[float(row[name]) for name in ("late_success", "final", "steps_to_0.9")] for row in of]).T
 
 
@@ -40,6 +40,20 @@ def test_push_learns_in_fewer_steps():
     assert f"That is {less} less than after 160,000 with images" in page("preset_mirror")
 
 
+def test_pick_and_place_learns_in_fewer_steps():
+    plain, images = (runs("frugal", "pick_and_place", setting, 320_000, 710) for setting in ("plain", "mirror"))
+    assert presets.preset("frugal", "pick_and_place").config.total_steps == 320_000
+    first, mirror = f"{np.median(images[2]):,.0f}", page("preset_mirror")
+    assert f"0.90 comes after {first} steps in the median ({images[2].min():,.0f} to {images[2].max():,.0f})" in mirror
+    reached = plain[2][plain[2] < np.inf]
+    assert len(reached) == 6
+    lost = "{:.3f} and {:.3f}".format(*np.sort(plain[1])[:2])
+    assert f"images take {reached.min():,.0f} to {reached.max():,.0f}, and two end at {lost}." in mirror
+    lowest = f"the lowest ends at {images[1].min():.3f}, which is {np.median(images[1]) - images[1].min():.3f} below the median"
+    assert lowest in mirror
+    assert f"and PickAndPlace in {first}, the medians" in (ROOT / "docs" / "real_robot.md").read_text()
+
+
 def test_a_shorter_slide_ends_lower():
     plain, short = runs("cpu", "slide", "plain", 1_280_000, 710)[1], runs("cpu", "slide", "shared", 1_024_000, 710)[1]
     lower = with_interval(plain - short, "{:.3f} ({:.3f} to {:.3f})")
@@ -55,6 +69,11 @@ def test_shared_candidates_cost_success():
         row = f"| {words} | {measure} | {(shared[0] > other[0]).sum()} of 40 | {last} |"
         assert row in page("bakeoff_repeats")
     assert f"It ends at {shared[1].mean():.3f}." in page("bakeoff_repeats")
+    four, again = (runs("cpu", "slide", setting, 1_280_000, 710) for setting in ("mirror_again", "shared_again"))
+    measure, last = (with_interval(gain, form) for gain in again[:2] - four[:2])
+    assert (again[0] < four[0]).sum() == 8
+    ends = f"{four[1].mean():.3f} and {again[1].mean():.3f}"
+    assert f"{measure}, behind in eight, and {last} at the end, where they have {ends}." in page("bakeoff_repeats")
     with (ROOT / "docs" / "unseen_runs.csv").open() as file:
         here = [float(row["final"]) for row in csv.DictReader(file) if (row["learner"], row["task"]) == ("cpu", "slide")]
     ends = f"six seeds end at {np.mean(here):.3f} on `native` and [forty others](bakeoff_repeats.md#cost-of-td_error) at"
