@@ -82,6 +82,7 @@ class FetchEnv(SimulatedTask):
     task: ClassVar[FetchTask]
     action_size, goal_size = 4, 3
     threshold = 0.05  # m
+    _strict = True
     goal_distance = staticmethod(euclidean)
 
     def load(self) -> mujoco.MjModel:
@@ -117,9 +118,7 @@ class FetchEnv(SimulatedTask):
 
     @property
     def mirror(self) -> MirrorFn:
-        """Image at the vertical plane along x through the gripper's start. A subclass needs `keeps_mirror` (AttributeError)."""
-        if type(self).__module__ != __name__ and not vars(type(self)).get("keeps_mirror"):
-            raise AttributeError(f"the inherited mirror may contradict {type(self).__name__}, unless it sets keeps_mirror")
+        """Image at the vertical plane along x through the gripper's start."""
         from mjx_dher import mirror  # only runs with mirror images need it
 
         return functools.partial(mirror.across_y, self._entries, self.task.initial_grip_pos[1])
@@ -187,10 +186,6 @@ class FetchEnv(SimulatedTask):
         if self.has_object:
             sound &= jnp.linalg.norm(qvel[self._object_qvel][:3]) < MAX_OBJECT_SPEED
         return sound
-
-    def _success(self, achieved_goal: Array, desired_goal: Array) -> Array:
-        # Strict, unlike the reward, as in the original.
-        return (self.goal_distance(achieved_goal, desired_goal) < self.distance_threshold).astype(jnp.float32)
 
     def _sample_object(self, key: PRNGKey) -> Array:
         """Draws the object's qpos [7]: upright, uniform around the gripper, at least `min_object_distance` away."""
@@ -286,6 +281,7 @@ class Reach(FetchEnv):
     """FetchReach: the goal is a position of the grip point, up to 15 cm away along each axis. The observation is [10]."""
 
     name = "reach"
+    keeps_mirror = True
     task = FetchTask(
         xml="reach.xml",
         arm_qpos=(0.00969146345, -0.825628071, -0.00312048482, 1.4438479, 0.00263934828, 0.953287132, 0.0058733811),
@@ -299,6 +295,7 @@ class Push(FetchEnv):
     """FetchPush: the goal lies on the table, up to 15 cm from the gripper along x and y."""
 
     name = "push"
+    keeps_mirror = True
     task = FetchTask(
         xml="push.xml",
         arm_qpos=(0.0116377772, -0.580433428, -0.00457914917, 1.42152997, 0.00145336833, 0.690240166, 0.00724187328),
@@ -314,6 +311,7 @@ class PickAndPlace(FetchEnv):
     """FetchPickAndPlace: like Push, but `action[3]` moves the fingers, and half of the goals lie up to 45 cm higher."""
 
     name = "pick_and_place"
+    keeps_mirror = True
     task = FetchTask(
         xml="pick_and_place.xml",
         arm_qpos=(0.00969037654, -0.825628108, -0.00311989443, 1.44384795, 0.00264075557, 0.953287094, 0.00587191243),
@@ -329,6 +327,7 @@ class Slide(FetchEnv):
     """FetchSlide: a puck on a slippery table. The goal lies up to 30 cm around a point 40 cm ahead of the gripper."""
 
     name = "slide"
+    keeps_mirror = True
     task = FetchTask(
         xml="slide.xml",
         arm_qpos=(0.0133685885, -0.575905496, -0.005929734, 1.4139215, -1.28234476e-06, 0.682503565, 0.00871218759),

@@ -183,6 +183,7 @@ class HandTask(MujocoTask):
     """The Shadow hand, whose action moves 20 servos: -1 and 1 are the ends of their ranges."""
 
     control = Actuators()
+    _strict = True
     observations: tuple[str, ...] = (f"qpos:{JOINTS}", f"qvel:{JOINTS}")
 
     def init_state(self, qpos: Array, desired_goal: Array, qvel: Array | None = None) -> State:
@@ -203,9 +204,6 @@ class HandTask(MujocoTask):
         rotation = qpos[27:]  # empty without an object
         qpos = jnp.concatenate([qpos[:27], rotation / jnp.maximum(_norm(rotation), 1e-12)])
         return self.first_state(start.replace(qpos=qpos, qvel=moving), desired_goal)  # type: ignore[attr-defined]
-
-    def _success(self, achieved_goal: Array, desired_goal: Array) -> Array:
-        return (self.goal_distance(achieved_goal, desired_goal) < self.distance_threshold).astype(jnp.float32)
 
 
 class HandReach(HandTask):

@@ -51,6 +51,7 @@ class SimulatedTask(GoalEnv):
     varied: Mapping[str, tuple[float, float]] | str = MappingProxyType({})
     threshold: float  # default of `distance_threshold`; `bind` may set it
     goal_distance: DistanceFn
+    _strict = False  # whether success, unlike the reward, needs less than the threshold, as in the Fetch and hand originals
     _object: Range | None = None  # of the free body that `with_object` moves
     _rest: Physics  # start, and state after a divergence
 
@@ -272,7 +273,8 @@ class SimulatedTask(GoalEnv):
         return physics
 
     def _success(self, achieved_goal: Array, desired_goal: Array) -> Array:
-        return self.reached(achieved_goal, desired_goal).astype(jnp.float32)
+        near = self.goal_distance(achieved_goal, desired_goal) < self.distance_threshold
+        return (near if self._strict else self.reached(achieved_goal, desired_goal)).astype(jnp.float32)
 
 
 def _ranges_of(varied: Any) -> dict[str, tuple[float, float]]:

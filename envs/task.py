@@ -47,7 +47,8 @@ __all__ = [
 _ELSEWHERE = {
     **dict.fromkeys(("threshold", "distance_threshold"), "the goal's threshold"),
     **dict.fromkeys(("observation_size", "layout"), "observations"),
-    **{"dt": "hz", "goal_size": "goal", "action_size": "control", "rest_action": "start"},
+    **{"dt": "hz", "timestep": "hz", "frame_skip": "hz", "goal_size": "goal", "rest_action": "start"},
+    **{"action_size": "control", "ctrl": "control", "obs": "observations", "reward_range": "spec"},
 }
 
 
@@ -247,10 +248,15 @@ def _check_names(task: type) -> None:
     annotated = SimulatedTask.__annotations__ | MujocoTask.__annotations__
     fields = [name for name in annotated if name[0] != "_" and name not in ("threshold", "goal_distance")]
     arguments = inspect.signature(SimulatedTask).parameters.keys() - fields
-    for owner in task.__mro__[: task.__mro__.index(MujocoTask)]:
+    owners = task.__mro__[: task.__mro__.index(MujocoTask)]
+    kinds = {"control": Control, "goal": Goal, "start": Start}
+    left = {field: kind for field, kind in kinds.items() if not any(field in vars(owner) for owner in owners)}
+    for owner in owners:
         if elsewhere := sorted(vars(owner).keys() & _ELSEWHERE.keys()):
             raise ValueError(f"{owner.__name__}.{elsewhere[0]} is no field of a task; set {_ELSEWHERE[elsewhere[0]]} instead")
         for name in vars(owner).keys() - fields - vars(MujocoTask).keys():
+            if field := next((field for field, kind in left.items() if isinstance(vars(owner)[name], kind)), None):
+                raise ValueError(f"{owner.__name__}.{name} is no field of a task; set {field} instead")
             near = hint(name, fields, cutoff=0.85)
             if name in arguments or (near and not callable(vars(owner)[name])):
                 kind = "an argument of a task and not a field" if name in arguments else "no field of a task"

@@ -52,9 +52,13 @@ class Wrapper:
             raise AttributeError(name)
         if name in ("init_state", "first_state"):  # they have no key for the wrapper's memory
             raise AttributeError(f"a wrapped environment has no {name}: use reset(key)")
-        own = getattr(self.env, name)  # mirror, with_goal and with_object only if the environment has them
-        if name == "mirror" and not vars(type(self)).get("keeps_mirror"):
-            raise AttributeError(f"the inner mirror may contradict {type(self).__name__}, unless it sets keeps_mirror")
+        if name == "mirror":
+            from mjx_dher import mirror
+
+            if not vars(type(self)).get("keeps_mirror"):
+                raise AttributeError(f"the inner mirror may contradict {type(self).__name__}, unless it sets keeps_mirror")
+            return mirror.own(self.env)
+        own = getattr(self.env, name)  # with_goal and with_object only if the environment has them
         return {"with_goal": self._with_goal, "with_object": self._with_object}.get(name, own)
 
     def begin(self, key: PRNGKey, observation: PyTree, rest: Array) -> tuple[PyTree, PyTree]:

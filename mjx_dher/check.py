@@ -52,4 +52,4 @@ def kept(method: str, before: PyTree, after: PyTree, leading: int = 0) -> None:
     structure: Any = jax.tree.structure(before)
     if structure != jax.tree.structure(after) or differing:
         reason = (differing or ["its type or its static fields differ"])[0]
-        raise ValueError(f"{method} must keep the state's structure, shapes and types; {reason}")
+        raise ValueError(f"{method} must keep structure, shapes and types; {reason}")

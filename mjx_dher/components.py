@@ -16,7 +16,7 @@ class Component(NamedTuple):
     path: str  # module:attribute
     line: str  # description in `list`
     reads: tuple[str, ...] = ()  # settings that it reads and others of its field do not
-    group: str = "episodes"  # of a priority: what it chooses among. Runs of one compiled program can differ within a group
+    group: str = "episodes"  # of a priority: what it chooses among. Runs of one program can differ within a group
 
 
 _BY_METRIC = ("metric",)
@@ -107,10 +107,10 @@ _TABLE = {
             "priorities", "episodes and relabelled transitions by their one-step errors (HGR)", ("renewals",), "transitions"
         ),
         "td_error_shared": Component(
-            "priorities", "the same in less time: four places share each candidate's error", ("renewals",), "transitions"
+            "priorities", "the same in less time: four places share each candidate's error", ("renewals",), "shared"
         ),
         "curriculum": Component(
-            "contrib.priorities", "transitions with diverse goals at first, near goals later (CHER)", group="transitions"
+            "contrib.priorities", "transitions with diverse goals at first, near goals later (CHER)", group="curriculum"
         ),
         "not_misleading": Component(
             "contrib.priorities",

@@ -81,19 +81,16 @@ def summarize(success: Any, reset_success: Any, ret: Any, valid: Any = None) -> 
 
 
 def summary(outcome: Outcome) -> dict[str, Array]:
-    """Means [] over the episodes, traced. An invalid episode counts as a failure and has no return."""
+    """Success rates [], traced. An invalid episode counts as a failure."""
     return {
         "success_rate": jnp.mean(outcome.success),
         "reset_success_rate": jnp.mean(outcome.reset_success),
-        "return_mean": return_mean(outcome),
     }
 
 
-def return_mean(outcome: Outcome) -> Array:
-    """Mean return [] of the valid episodes; NaN if there is none."""
-    count = jnp.sum(outcome.valid, dtype=outcome.ret.dtype)
-    total = jnp.sum(jnp.where(outcome.valid, outcome.ret, 0.0))
-    return jnp.where(count > 0, total / jnp.maximum(count, 1.0), jnp.nan)
+def returns(outcome: Outcome) -> Array:
+    """Sum of the valid episodes' returns, and their number, [2]."""
+    return jnp.stack([jnp.sum(jnp.where(outcome.valid, outcome.ret, 0.0)), jnp.sum(outcome.valid, dtype=outcome.ret.dtype)])
 
 
 def faults(outcome: Outcome) -> dict[str, Array]:

@@ -11,15 +11,39 @@ import numpy as np
 from mjx_dher import check, lookup
 from mjx_dher.types import Array, Batch, MirrorFn, PRNGKey
 
+PARTS = ("observation", "goal", "action")
+
 
 def of_env(env: Any) -> MirrorFn:
     """The method `mirror` of an environment. Raises ValueError if it has none, or it is no function of three arguments."""
     try:
-        mirror = env.mirror
+        mirror = own(env)
     except AttributeError as error:
         needed = "augmentation mirror needs the environment's method mirror(observation, goal, action)"
         raise ValueError(f"{needed}: {error}. Without it, choose augmentation none") from error
-    return cast("MirrorFn", lookup.check_function("mirror", mirror, ("observation", "goal", "action")))
+    return cast("MirrorFn", lookup.check_function("mirror", mirror, PARTS))
+
+
+def own(env: Any) -> Any:
+    """The attribute `mirror` of an environment. Raises AttributeError if it has none, or if its class inherits it, not from a
+    mixin, and does not set `keeps_mirror` itself: its observations may be others, whose images would be wrong without an error.
+    """
+    task = type(env)
+    owner = next((base for base in task.__mro__ if "mirror" in vars(base)), task)
+    is_mixin = owner in task.__bases__ and not hasattr(owner, "reset")
+    if not (owner is task or is_mixin or vars(task).get("keeps_mirror")):
+        raise AttributeError(f"the inherited mirror may contradict {task.__name__}, unless it sets keeps_mirror")
+    return env.mirror
+
+
+def of_parts(mirror: MirrorFn, *given: Any, leading: int) -> tuple[Any, Array, Array]:
+    """Mirror image of an observation, a goal and an action. Raises ValueError if it has other shapes, after `leading` axes."""
+    image = mirror(*given)
+    if not isinstance(image, tuple) or len(image) != len(PARTS):
+        got = f"{len(image)} of them" if isinstance(image, tuple) else f"a {type(image).__name__}"
+        raise ValueError(f"mirror must return a tuple of {', '.join(PARTS)}; got {got}")
+    check.kept("mirror", dict(zip(PARTS, given)), dict(zip(PARTS, image)), leading)
+    return image
 
 
 def half(batch: Batch, mirror: MirrorFn, key: PRNGKey) -> Batch:
@@ -36,10 +60,7 @@ def half(batch: Batch, mirror: MirrorFn, key: PRNGKey) -> Batch:
     """
 
     def seen(observation: Any, goal: Array) -> tuple[Any, Array, Array]:
-        given = observation, goal, batch.action
-        image = mirror(*given)
-        check.kept("mirror", given, image)
-        return image
+        return of_parts(mirror, observation, goal, batch.action, leading=batch.reward.ndim)
 
     hindsight = batch.hindsight_goal
     observation, goal, action = seen(batch.observation, batch.desired_goal)

@@ -41,7 +41,7 @@ class Priority:
     weigh: PriorityFn | None = None  # weight of an episode when it is added
     renew: RenewFn | None = None  # weights of the ring's episodes, once per cycle, before learning
     choose: ChooseFn | None = None  # choice among relabelled transitions
-    candidates: int = CANDIDATES  # transitions drawn per transition that `choose` keeps. `by_weight` takes 1 or CANDIDATES
+    candidates: int = CANDIDATES  # transitions drawn per transition that `choose` keeps
     uses_values: bool = False  # whether it reads `context.values`
     by_part: bool = False  # whether `renew` weighs each episode alone and may get part of the ring (`Config.renewals`)
     renews: Callable[[Context], Array] | None = None  # whether a lane's priority has `renew`, if lanes differ in it (`join`)
@@ -146,9 +146,9 @@ def choose(
 
 
 def by_weight(weigh: Callable[[Sample, Batch, Context], Array]) -> ChooseFn:
-    """Makes a `choose` that keeps one of CANDIDATES transitions, in proportion to the weights [B'] from `weigh`.
+    """Makes a `choose` that keeps one of `Priority.candidates` transitions, in proportion to the weights [B'] from `weigh`.
 
-    With `Priority.candidates` 1, each is weighed once and is a candidate of CANDIDATES choices, no two of which share another
+    With 1 candidate, each is weighed once and is a candidate of CANDIDATES choices, no two of which share another
     (if 17 or more are drawn). So it can be kept up to CANDIDATES times in a draw, which is of many batches.
 
     A weight that is not positive and finite counts as 0. If all candidates have weight 0, the choice is uniform. Raises
@@ -159,8 +159,9 @@ def by_weight(weigh: Callable[[Sample, Batch, Context], Array]) -> ChooseFn:
         weight = weigh(sample, batch, context)
         weight = check.array("priority: weights [B] of transitions", weight, batch.reward.shape, jnp.number)
         places = jnp.arange(number, dtype=jnp.int32)[:, None]
-        groups = CANDIDATES * places + jnp.arange(CANDIDATES, dtype=jnp.int32)[None]
-        if len(weight) < CANDIDATES * number:  # they share: the differences of 0, 1, 3 and 9 modulo 13 are all different
+        candidates = len(weight) // number
+        groups = candidates * places + jnp.arange(candidates, dtype=jnp.int32)[None]
+        if candidates == 1:  # they share: the differences of 0, 1, 3 and 9 modulo 13 are all different
             apart = [step * max(len(weight), 13) // 13 for step in (0, 1, 3, 9)]
             groups = (places + jnp.asarray([apart], jnp.int32)) % len(weight)
         weight = replay.as_priority(weight)[groups]

@@ -111,7 +111,7 @@ def record_rollout(
     valid = ~end.failed & _is_finite((episodes, jnp.moveaxis(reward, 0, 1)))
     outcome = Outcome(
         success=jnp.where(valid, last.success, 0.0),
-        reset_success=first.success,
+        reset_success=jnp.where(valid, first.success, 0.0),
         ret=jnp.sum(reward, axis=0),
         valid=valid,
         bad_rewards=_bad_rewards(spec, reward, end.length),

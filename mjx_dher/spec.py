@@ -96,7 +96,7 @@ _LANE_FIELDS = ("sampler", "weight_kernel", "weight_normalization", "metric", "g
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Options of training that do not affect the result of a run: last evaluation, checkpoints and logs."""
+    """Options of training that do not affect how a run learns: last evaluation, checkpoints, logs and an early stop."""
 
     final_episodes: int = 500
     """Episodes of the final evaluation."""
@@ -202,14 +202,14 @@ def validate(spec: RunSpec, episode_length: int | None = None) -> None:
 
     Args:
       episode_length: steps of an existing environment, whose name is then not checked. Default: the argument of that name or
-        50, and 1 for a custom environment.
+        50. Sizes that depend on a custom environment's are not checked without it.
 
     Raises:
       ValueError: names each invalid field, its value and the allowed values.
     """
     names = [(check_name, field, getattr(spec, field), table, True) for field, table in COMPONENTS.items()]
     if episode_length is None:
-        episode_length = 1 if is_import_path(spec.env) else _episode_length(spec)
+        episode_length = None if is_import_path(spec.env) else _episode_length(spec)
     else:
         del names[0]
     files = [] if spec.demonstrations is None else [(find_demonstrations, spec.demonstrations)]

@@ -82,11 +82,11 @@ def check_seed(seed: Any) -> None:
     check_number("seed", seed, "[0, 4294967295]")
 
 
-def validate(config: Config, hparams: HParams, episode_length: int) -> None:
-    """Checks sizes and numbers of a run. Arrays of numbers, one per seed, are not checked. Raises ValueError with each invalid
-    field, its value and the allowed values.
+def validate(config: Config, hparams: HParams, episode_length: int | None) -> None:
+    """Checks sizes and numbers of a run. Arrays of numbers, one per seed, are not checked, nor are sizes that depend on an
+    episode's length without it. Raises ValueError with each invalid field, its value and the allowed values.
     """
-    check_count("episode_length", plain(episode_length))
+    check_count("episode_length", 1 if episode_length is None else plain(episode_length))
     problems = [*_field_problems(config)] or [*_size_problems(config, episode_length)]
     problems += _field_problems(hparams)
     if problems:
@@ -137,16 +137,10 @@ def _number_problem(field: str, value: Any, number: Number, kind: type) -> str |
     return None if number.contains(value) else f"{field} must lie in {number.interval}; got {value!r}"
 
 
-def _size_problems(c: Config, episode_length: int) -> Iterator[str]:
+def _size_problems(c: Config, episode_length: int | None) -> Iterator[str]:
     """Problems of sizes that depend on each other."""
     if problem := delay_problem(c, c.policy_delay):
         yield problem
-    cycle = c.num_envs * episode_length
-    if c.replay_size < cycle:
-        yield (
-            f"replay_size must hold at least one cycle of {c.num_envs} episodes x {episode_length} steps = {cycle}"
-            f" transitions; got {c.replay_size}"
-        )
     if c.batch_size > c.replay_size:
         yield f"batch_size must not exceed replay_size ({c.replay_size}); got {c.batch_size}"
     period, delay = c.target_period, c.policy_delay
@@ -155,6 +149,14 @@ def _size_problems(c: Config, episode_length: int) -> Iterator[str]:
         yield (
             f"batch_size must not exceed {_INT32_MAX // at_once} with target_period {period} and policy_delay {delay}, because"
             f" the batches of {at_once} updates are drawn at once; got {c.batch_size}"
+        )
+    if episode_length is None:
+        return
+    cycle = c.num_envs * episode_length
+    if c.replay_size < cycle:
+        yield (
+            f"replay_size must hold at least one cycle of {c.num_envs} episodes x {episode_length} steps = {cycle}"
+            f" transitions; got {c.replay_size}"
         )
     epochs = num_epochs(c, episode_length)
     for field, count in (

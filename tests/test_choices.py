@@ -11,6 +11,7 @@ from test_methods import CONTEXT, HP, candidates, chosen, ring_with
 from mjx_dher import priorities, relabel, replay
 from mjx_dher.contrib import priorities as contributed
 from mjx_dher.runs.program import Lane
+from mjx_dher.spec import RunSpec
 
 BY_GOAL = priorities.by_weight(lambda sample, batch, context: batch.desired_goal[:, 0])
 
@@ -49,7 +50,24 @@ def test_as_many_are_drawn_as_a_priority_or_the_neediest_of_several_asks_for():
         relabel.draw_batches(ring, jax.random.key(0), (6,), "future", context, replay.cumulative(ring), priority=joined)
     assert set(drawn) == {(12, 12, 6)}
     joined = {name: priorities.join(["td_error_shared", name]).candidates for name in ("eventful", "energy", "curriculum")}
-    assert joined == {"eventful": 1, "energy": 1, "curriculum": 4}
+    assert joined == {"eventful": 1, "energy": 1, "curriculum": 2}
+
+
+@pytest.mark.parametrize("number", [2, 3, 8])
+def test_every_candidate_can_be_kept(number):
+    sample, batch = candidates([1.0] * number * 50, [0.0] * number * 50, 50)
+    choose = jax.jit(jax.vmap(lambda key: BY_GOAL(key, sample, batch, 50, CONTEXT)))
+    indices = np.asarray(choose(jax.random.split(jax.random.key(0), 100)))
+    np.testing.assert_array_equal(indices // number, np.broadcast_to(np.arange(50), (100, 50)))
+    assert set(indices.ravel()) == set(range(number * 50))
+
+
+def test_what_draws_other_numbers_has_a_program_of_its_own():
+    """In one program a lane would draw as many candidates as the neediest, and so other ones than alone."""
+    alike = ("td_error", "dpp", "not_misleading")
+    programs = [RunSpec(priority=name).program for name in (*alike, "td_error_shared", "curriculum", "eventful")]
+    assert len(set(programs)) == 4
+    assert len(set(programs[:3])) == 1
 
 
 def test_weights_are_kept_in_proportion():

@@ -218,9 +218,10 @@ def test_layers_have_the_second_derivatives_of_flax(shape):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4 * float(jnp.abs(b).max()))
 
 
-def test_unit_norm_keeps_the_weights_of_each_hidden_unit_at_length_1():
+@pytest.mark.parametrize("name", ["ddpg", "td3"])
+def test_unit_norm_keeps_the_weights_of_each_hidden_unit_at_length_1(name):
     learner = learners.make(
-        "td3", dataclasses.replace(LEARNS, hidden_sizes=(4, 4), num_critics=1), spec_of(2, 2, 2), "unit_norm"
+        name, dataclasses.replace(LEARNS, hidden_sizes=(4, 4), num_critics=1), spec_of(2, 2, 2), "unit_norm"
     )
     ones = jnp.ones((8, 2))
     batch = Batch(ones, ones, ones, ones, -ones[:, 0], ones[:, 0], jnp.arange(8))

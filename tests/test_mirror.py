@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from conftest import refuses
 
-from mjx_dher import HParams, envs, make_train
+from mjx_dher import HParams, envs, make_train, mirror
 from mjx_dher.envs.fetch import Push, fetch_observation
+from mjx_dher.envs.task import MujocoTask
 from mjx_dher.envs.wrappers import ActionDelay, FrameStack, ObservationNoise, Wrapper
 from mjx_dher.mirror import half
 from mjx_dher.testing import check_env
@@ -42,7 +43,20 @@ class Sheared(Plane):
     """(x, y) becomes (x, x - y): twice is nothing, but distances change."""
 
     def mirror(self, observation, goal, action):
-        return observation, goal @ jnp.array([[1.0, 1.0], [0.0, -1.0]]), action
+        shear = jnp.array([[1.0, 1.0], [0.0, -1.0]])
+        return observation @ shear, goal @ shear, action
+
+
+class Unseen(Plane):
+    def mirror(self, observation, goal, action):
+        return observation, *super().mirror(observation, goal, action)[1:]
+
+
+class At(Plane):
+    """The same by an update of single numbers, which NumPy's arrays have not."""
+
+    def mirror(self, observation, goal, action):
+        return tuple(x.at[..., 0].multiply(-1.0) for x in (observation, goal, action))
 
 
 class Shorter(Plane):
@@ -97,15 +111,21 @@ def test_a_task_without_mirror_is_refused():
 
 def test_a_mirror_that_is_none_is_named_by_the_check():
     check_env(Plane())
+    check_env(At())
     for wrong, problem in (
-        (Turned, "mirror of a mirror"),
+        (Turned, "mirror of a mirror image must give the same result; observation"),
+        (Unseen, r"mirror must move observation and goal alike; observation\[0:2\] is the achieved goal"),
         (Sheared, "compute_reward of mirrored goals"),
-        (Shorter, "mirror must keep"),
+        (Shorter, r"mirror must keep structure, shapes and types; \['goal'\] is float32\[2\] and becomes float32\[1\]"),
     ):
         with pytest.raises(ValueError, match=problem):
             check_env(wrong())
-    for wrong in (Shorter().mirror, lambda observation, goal, action: (observation, goal)):
-        with pytest.raises(ValueError, match="mirror must keep"):
+    two = lambda observation, goal, action: (observation, goal)  # noqa: E731
+    for wrong, problem in (
+        (Shorter().mirror, r"\['goal'\] is .*\[2\] and"),
+        (two, "observation, goal, action; got 2 of"),
+    ):
+        with pytest.raises(ValueError, match=problem):
             half(transitions(4), wrong, jax.random.key(0))
 
 
@@ -177,7 +197,8 @@ def test_an_inherited_mirror_that_may_be_wrong_is_refused():
         (Delayed(Plane(), 1), "Delayed"),
         (Stacked(Plane(), 2), "Stacked"),
     ):
-        assert not hasattr(env, "mirror")
+        with pytest.raises(AttributeError, match=f"mirror may contradict {name}"):
+            mirror.own(env)
         with pytest.raises(
             ValueError, match=f"augmentation mirror needs .* mirror may contradict {name}, .* augmentation none"
         ):
@@ -189,6 +210,27 @@ def test_an_inherited_mirror_that_may_be_wrong_is_refused():
     assert hasattr(ActionDelay(ObservationNoise(Plane(), 0.1), 2), "mirror")
     with refuses("mirror", "observation"):
         envs.make("push").mirror(jnp.ones(26), jnp.ones(3), jnp.ones(4))
+
+
+def test_a_subclass_of_an_own_task_must_say_that_it_keeps_its_mirror():
+    """Its observations may be others, whose image would be wrong without an error."""
+    base = type("Base", (MujocoTask,), {"mirror": lambda self, *parts: parts})
+    mixin = type("Mixin", (), {"mirror": lambda self, *parts: parts})
+    wider = type("Wider", (base,), {"observations": ("qvel:*",)})
+    mixed = type("Mixed", (mixin, MujocoTask), {})
+
+    def has(cls):
+        try:
+            mirror.own(object.__new__(cls))
+        except AttributeError:
+            return False
+        return True
+
+    assert [has(cls) for cls in (MujocoTask, base, wider, mixed)] == [False, True, False, True]
+    assert [has(type("Deeper", (cls,), {})) for cls in (wider, mixed)] == [False, False]
+    for cls in (wider, mixed):
+        assert has(type("Kept", (cls,), {"keeps_mirror": True}))
+        assert has(type("Own", (cls,), {"mirror": lambda self, *parts: parts}))
 
 
 def test_the_image_of_an_observation_is_the_observation_of_the_image():

@@ -333,6 +333,7 @@ def test_a_task_that_exits_while_it_runs_is_an_error(monkeypatch, tmp_path, caps
 def test_nothing_is_assumed_of_the_length_of_its_episodes():
     short = RunSpec(env="point_mass:PointMass", config=Config(num_envs=8, replay_size=80, batch_size=16))
     spec.validate(short)
+    spec.validate(short.replace(num_envs=1, total_steps=2_000_000_000))  # 40 million cycles of 50 steps, of 40 updates each
     with refuses("replay_size", 400, 80):
         spec.validate(dataclasses.replace(short, env="push"))
     with refuses("replay_size", 160, 80):

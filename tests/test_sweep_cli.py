@@ -141,6 +141,7 @@ def test_a_signal_in_the_last_epoch_loses_nothing(tmp_path, point_mass, monkeypa
         (["--seeds", "0"], r"seeds must lie in \[1, .*; got 0"),
         (["--first-seed", "-1"], r"first_seed must lie in \[0, .*; got -1"),
         (["--checkpoint-every", "-1"], r"checkpoint_every must lie in \[0, .*; got -1"),
+        (["--baseline", "futrue, k 4"], r"baseline, .* must be one of random, .* got 'futrue' \(did you mean 'future'"),
         (["--lanes", "0"], r"lanes must lie in \[1, .*; got 0"),
         (["--threshold", "2"], r"threshold must lie in \(0, 1\]; got 2"),
         (["--sweep.gamma", "0.9", "1.5"], r"gamma must lie in \[0, 0.9999999\]; got 1.5"),

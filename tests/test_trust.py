@@ -315,6 +315,9 @@ def test_a_file_that_lacks_a_setting_is_rejected_or_names_it(here, capsys):
     (here / "run" / "config.json").write_text(json.dumps(content))
     assert cli.main(["--config", "run", "--dry-run"]) == 0
     assert "edited since; it lacks num_critics" in capsys.readouterr().out
+    (here / "run" / "config.json").write_text(json.dumps({**content, "hparams": {**content["hparams"], "gama": 0.9}}))
+    assert cli.main(["--config", "run", "--dry-run"]) == 2
+    assert "hparams has no setting 'gama' (did you mean 'gamma'?)" in capsys.readouterr().err
     del content["config"]["batch_size"]
     (here / "run" / "config.json").write_text(json.dumps(content))
     assert cli.main(["--config", "run", "--dry-run"]) == 2

@@ -120,7 +120,7 @@ def make_engine(name: str, model: mujoco.MjModel, substeps: int, varied: Sequenc
       substeps: MuJoCo timesteps per environment step.
       varied: numbers of the model that differ between environments, such as "mass:box" (`variation.Variation`).
       **options: for native `num_threads`; for jax `iterations` and `ls_iterations` of the constraint solver; for warp these
-        two, `constraints` (memory for rows) and `allow_cpu`.
+        two, `constraints` and `contacts` (memory for rows), `path` ("fused", "graph" or "auto") and `allow_cpu`.
 
     Raises:
       ValueError: there is no such engine or option, or the engine does not support the model or this machine.

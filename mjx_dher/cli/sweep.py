@@ -19,6 +19,7 @@ from mjx_dher.components import doc
 from mjx_dher.config import Config, HParams
 from mjx_dher.fleet import chunks
 from mjx_dher.fleet.chunks import FleetOptions
+from mjx_dher.lookup import check_name
 from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
 from mjx_dher.spec import Engine, Options, RunSpec
 from mjx_dher.sweeps import grid
@@ -117,7 +118,10 @@ def parse_sweep_args(argv: list[str], report: Callable[[str], None] = lambda tex
     if args.preset == "auto" and args.fleet.ray is None:  # else the preset is known once the cluster is joined
         trials_of(args, preset)  # raises for invalid ones before CUDA starts
         preset = presets.machine_preset()
-    return args, trials_of(args, preset)
+    trials = trials_of(args, preset)
+    samplers = dict.fromkeys([*components.COMPONENTS["sampler"], *(trial.sampler for trial in trials)])
+    check_name("baseline, up to its first comma,", args.baseline.partition(",")[0], tuple(samplers))
+    return args, trials
 
 
 def _without_unread(args: SweepArgs, trials: list[RunSpec], report: Callable[[str], None]) -> SweepArgs:

@@ -181,5 +181,5 @@ def not_misled(sample: Sample, batch: Batch, context: Context) -> Array:
 
 
 dpp = Priority(weigh=diversity, choose=_in_groups(pick_diverse, 2))
-curriculum = Priority(choose=_in_groups(pick_curriculum, _CURRICULUM_GROUP))
+curriculum = Priority(choose=_in_groups(pick_curriculum, _CURRICULUM_GROUP), candidates=2)
 not_misleading = Priority(choose=by_weight(not_misled))

@@ -88,7 +88,8 @@ class DDPG(ActorCriticBase):
         gradients, metrics = compute_gradients(self.learning, state.params, state.target, batch, bounds, hparams)
         adam = common.adam(Params(actor=hparams.actor_lr, critic=hparams.critic_lr), hparams.adam_eps)
         updates, opt_state = adam.update(self.mean(gradients), state.opt_state)
-        params = self.project(optax.apply_updates(state.params, updates))
+        params = optax.apply_updates(state.params, updates)
+        params = Params(actor=self.project(params.actor), critic=self.project(params.critic))
         state = dataclasses.replace(state, params=params, opt_state=opt_state, num_updates=state.num_updates + 1)
         return state, metrics
 

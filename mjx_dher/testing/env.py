@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher import check, context, contract, rollout
+from mjx_dher import check, context, contract, mirror, rollout
 from mjx_dher.testing.trial import TOLERANCE, attempt, compiled, expect, expect_range, expect_same, run
 from mjx_dher.types import Env, EnvSpec
 
@@ -36,8 +36,8 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
     - If all rewards are at an end of the range, success is never 1 at the low end, and not always 0 at the high end. They need
       not agree at each step, because an environment may require more for a success, such as rest.
     - An episode has at least one step. States after its end (`EnvSpec.ends`) and states with `failed` are ignored.
-    - `mirror`, if present, keeps shapes, types and the rewards of goals. A mirror image of a mirror image is the original.
-      Whether the physics follows its image is not tested.
+    - `mirror`, if present, keeps shapes, types and the rewards of goals. A mirror image of a mirror image is the original, and
+      observations that contain the achieved goal do so in the image. Whether the physics follows its image is not tested.
     - `with_goal`, if present, sets another desired goal, which the state keeps, and changes nothing else. A step to a state
       that reaches it differs only in reward and success: `terminal` holds for every goal, and observations do not have it.
 
@@ -194,21 +194,39 @@ def _check_goal_is_apart(step: Callable[[Any], dict[str, Any]], state: Any, goal
 
 def _check_mirror(env: Any, obs: Any, actions: NDArray, valid: NDArray, tolerance: float) -> None:
     """Checks mirror images of the states in the mask `valid` [T, N]. `obs` and `actions` lead with [T, N], too."""
-    if not hasattr(env, "mirror"):
+    try:
+        mirror.own(env)
+    except AttributeError:
         return
     observation, achieved, desired = (jax.tree.map(lambda x: x[valid], obs[name]) for name in ("observation", *GOALS))
-    actions = actions[valid]
+    named = lambda parts: dict(zip(mirror.PARTS, parts))  # noqa: E731
 
-    def mirror(goal: Any) -> tuple[Any, Any]:
-        image = env.mirror(observation, goal, actions)
-        check.kept("mirror", (observation, goal, actions), image)
+    def twice(*given: Any) -> tuple[Any, Any]:
+        image = mirror.of_parts(env.mirror, *given, leading=1)
         return image, env.mirror(*image)
 
-    image, again = run("mirror", mirror, desired)
-    expect_same("mirror of a mirror image", again, (observation, desired, actions), tolerance)
-    other, _ = run("mirror", mirror, achieved)
+    image, again = run("mirror", twice, observation, desired, actions[valid])
+    expect_same("mirror of a mirror image", named(again), named((observation, desired, actions[valid])), tolerance)
+    other, _ = run("mirror", twice, observation, achieved, actions[valid])
     rewards = [run("compute_reward", env.compute_reward, *pair) for pair in ((achieved, desired), (other[1], image[1]))]
     expect_same("compute_reward of mirrored goals", rewards[1], rewards[0], tolerance)
+    lost = _places(observation, achieved, tolerance) - _places(other[0], other[1], tolerance)
+    if lost and np.ptp(achieved, axis=0).any():
+        where = f"[{min(lost)}:{min(lost) + achieved.shape[1]}]"
+        expect(
+            False, f"mirror must move observation and goal alike; observation{where} is the achieved goal, but not in the image"
+        )
+
+
+def _places(observation: Any, goal: NDArray, tolerance: float) -> set[int]:
+    """First indices, in the observation's vectors, of G numbers that equal the goal [N, G] in all states."""
+    vectors = [leaf for leaf in map(np.asarray, jax.tree.leaves(observation)) if leaf.ndim == 2]
+    flat = np.concatenate([np.zeros((len(goal), 0)), *vectors], axis=1)
+    if flat.shape[1] < goal.shape[1]:
+        return set()
+    windows = np.lib.stride_tricks.sliding_window_view(flat, goal.shape[1], axis=1)  # [N, D - G + 1, G]
+    same = np.isclose(windows, goal[:, None], rtol=tolerance, atol=tolerance).all(axis=(0, 2))
+    return set(np.flatnonzero(same).tolist())
 
 
 def _check_rewards(env: Any, spec: EnvSpec, played: dict[str, NDArray], valid: NDArray, tolerance: float) -> None:

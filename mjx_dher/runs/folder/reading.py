@@ -272,6 +272,9 @@ def to_spec(path: Path, content: dict[str, Any], trusted: bool = False) -> RunSp
         config = {**content["config"], "hidden_sizes": tuple(content["config"]["hidden_sizes"])}
         if missing := fingerprint.ALWAYS - {*content, *config, *content["hparams"]}:  # a default could be wrong
             raise ValueError(f"it lacks {', '.join(sorted(missing))}")
+        for part, known in (("config", [field.name for field in dataclasses.fields(Config)]), ("hparams", HParams._fields)):
+            if unknown := sorted(content[part].keys() - known - fingerprint.REMOVED.keys()):
+                raise ValueError(f"{part} has no setting {unknown[0]!r}{lookup.hint(unknown[0], known)}")
         spec = RunSpec(
             config=Config(**{name: value for name, value in config.items() if name not in fingerprint.REMOVED}),
             hparams=HParams(**{name: math.inf if x == run_folder.INFINITE else x for name, x in content["hparams"].items()}),
