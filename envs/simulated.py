@@ -273,8 +273,9 @@ class SimulatedTask(GoalEnv):
         return physics
 
     def _success(self, achieved_goal: Array, desired_goal: Array) -> Array:
-        near = self.goal_distance(achieved_goal, desired_goal) < self.distance_threshold
-        return (near if self._strict else self.reached(achieved_goal, desired_goal)).astype(jnp.float32)
+        if self._strict:
+            return (self.goal_distance(achieved_goal, desired_goal) < self.distance_threshold).astype(jnp.float32)
+        return self.reached(achieved_goal, desired_goal).astype(jnp.float32)
 
 
 def _ranges_of(varied: Any) -> dict[str, tuple[float, float]]:

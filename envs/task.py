@@ -47,7 +47,7 @@ __all__ = [
 _ELSEWHERE = {
     **dict.fromkeys(("threshold", "distance_threshold"), "the goal's threshold"),
     **dict.fromkeys(("observation_size", "layout"), "observations"),
-    **{"dt": "hz", "timestep": "hz", "frame_skip": "hz", "goal_size": "goal", "rest_action": "start"},
+    **{"dt": "hz", "frame_skip": "hz", "goal_size": "goal", "rest_action": "start"},
     **{"action_size": "control", "ctrl": "control", "obs": "observations", "reward_range": "spec"},
 }
 

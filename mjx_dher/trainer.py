@@ -202,16 +202,14 @@ def _epoch(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     key, eval_key = jax.random.split(state.key)
     discarded = split.total(jnp.sum(cycles.pop("discarded_episodes"), dtype=jnp.int32), loop.axis_name)
     outcome = _evaluate(loop, state, eval_key, loop.config.eval_episodes)
-    trained, own = split.total((jnp.sum(cycles.pop("returns"), axis=0), evaluate.returns(outcome)), loop.axis_name)
+    trained, tested = split.total((jnp.sum(cycles.pop("train_return_mean"), axis=0), evaluate.returns(outcome)), loop.axis_name)
     means = split.mean(jax.tree.map(lambda x: replay.mean(x, len(x)), cycles), loop.axis_name)
     evaluated = split.mean((evaluate.summary(outcome), evaluate.faults(outcome)), loop.axis_name)
-    returns = {"return_mean": own[0] / own[1], "train_return_mean": trained[0] / trained[1]}  # NaN without valid episodes
-    faults = {name: jnp.maximum(means[name], share) for name, share in evaluated[1].items()}
-    metrics = evaluated[0] | means | returns
-    summary = loop.learner.summary(state.learner)
-    learners.check_metrics("summary", summary, means)
-    metrics |= summary
-    return dataclasses.replace(state, key=key), metrics | faults | {"discarded_episodes": discarded}
+    returns = {"return_mean": tested[0] / tested[1], "train_return_mean": trained[0] / trained[1]}  # NaN without valid episodes
+    faults = {name: jnp.maximum(means[name], share) for name, share in evaluated[1].items()} | {"discarded_episodes": discarded}
+    own = loop.learner.summary(state.learner)
+    learners.check_metrics("summary", own, means)
+    return dataclasses.replace(state, key=key), evaluated[0] | means | returns | own | faults
 
 
 def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
@@ -241,7 +239,7 @@ def _cycle(loop: Loop, state: TrainState) -> tuple[TrainState, Metrics]:
     learner = jax.tree.map(lambda new, old: jnp.where(can_learn, new, old), learned, learner)
     metrics = {
         "train_success_rate": jnp.mean(outcome.success),
-        "returns": evaluate.returns(outcome),
+        "train_return_mean": evaluate.returns(outcome),  # sum and number
         "discarded_episodes": jnp.sum(~outcome.valid, dtype=jnp.int32),
         "priority_mean": priorities.mean(loop.priority, ring, weights, outcome.valid, context),
         **({"train_length_mean": jnp.mean(outcome.length, dtype=jnp.float32)} if loop.spec.ends else {}),

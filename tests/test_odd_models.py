@@ -233,17 +233,6 @@ def test_an_actuator_s_name_comes_before_a_joint_s():
     assert make(model, control=task.Torque("?")).parts[0].moved == ["k", "m"]
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "field"),
-    [("ctrl", task.JointDelta("j"), "control"), ("moves", task.Torque("j"), "control"), ("reward_range", (0.0, 1.0), "spec")],
-)
-def test_a_declaration_under_another_name_is_refused(name, value, field):
-    other = task.Joints("j")  # a name for later is allowed where the field is set
-    make(arm(POSITION), goal=task.Joints("j"), spare=other)
-    with refuses(f"{name} is no field of a task; set {field} instead"):
-        type("Own", (task.MujocoTask,), {"model": arm(POSITION), "goal": other, name: value})(engine="native")
-
-
 def test_controls_that_are_not_finite_fail_the_step():
     class Broken(task.MujocoTask):
         model, goal, control = arm(POSITION), task.Joints("j"), task.JointDelta("j")

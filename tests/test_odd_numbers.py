@@ -1,4 +1,6 @@
-"""Numbers of other kinds: 64 bits, random keys of other generators, NumPy's integers, booleans, paths and other steps."""
+"""Numbers of other kinds: 64 bits, random keys of other generators, NumPy's integers, booleans, paths, other steps, and means
+without discarded episodes.
+"""
 
 import dataclasses
 from pathlib import Path
@@ -8,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from configs import TINY
+from configs import SMALL, TINY
 from conftest import refuses
 from flax import struct
 
 import mjx_dher.gym
-from mjx_dher import RunSpec, relabel, replay, samplers, trainer
+from mjx_dher import RunSpec, make_train, relabel, replay, samplers, trainer
 from mjx_dher.config import HParams
 from mjx_dher.context import Context
 from mjx_dher.contrib import generators
@@ -25,7 +27,7 @@ from mjx_dher.runs import program
 from mjx_dher.runs.folder import checkpoint, restoring
 from mjx_dher.types import Episode
 from point_mass import PointMass
-from probes import Walk, WalkState
+from probes import Explodes, Walk, WalkState
 
 ENV = f"mjx_dher.gym:{mjx_dher.gym.ENV_ID}"
 HPARAMS = HParams(priority_fraction=0.5, lr_end=0.5)
@@ -261,3 +263,23 @@ def test_the_resting_point_needs_the_steps_of_its_formula():
         program.check_runs(Slow(), [spec])
     other = dataclasses.replace(spec, metric="velocity")
     program.make_loop(Slow(), other, program.choices_of([other]))
+
+
+@pytest.mark.parametrize("success", [1.0, jnp.nan])
+def test_a_discarded_episode_counts_in_no_mean(success):
+    """Its start is no success, and a cycle that has only such episodes leaves the epoch's mean return as it is."""
+
+    class Starts(Explodes):
+        def reset(self, key):
+            state = super().reset(key)
+            return dataclasses.replace(state, success=jnp.where(state.step == 0, success, 0.0))
+
+    program = make_train(Starts(None), dataclasses.replace(SMALL, num_envs=1, cycles_per_epoch=12, replay_size=1000))
+    state, metrics = jax.jit(program.epoch)(jax.jit(program.init)(jax.random.key(0), HParams()))
+    kept = int(state.replay.size)
+    assert 0 < kept < 12
+    assert metrics["discarded_episodes"] == 12 - kept
+    assert metrics["reset_success_rate"] == metrics["bad_success"] == 0
+    distance = jnp.linalg.norm(state.replay.episodes.achieved_goal - state.replay.episodes.desired_goal[:, None], axis=-1)
+    returns = -jnp.sum(distance[:kept, 1:] > 0.1, axis=1)
+    assert float(metrics["train_return_mean"]) == pytest.approx(float(returns.mean()), abs=1e-5)

@@ -231,3 +231,14 @@ def test_units_and_overlaps_of_drawn_starts_are_told():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         Reach("native")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "field"),
+    [("ctrl", JointDelta("yaw"), "control"), ("moves", JointDelta("yaw"), "control"), ("reward_range", (0.0, 1.0), "spec")],
+)
+def test_a_declaration_under_another_name_is_refused(name, value, field):
+    parts = {"model": XML, "goal": Joints("yaw")}
+    type("Own", (MujocoTask,), {**parts, "spare": Joints("elbow")})(engine="native")  # allowed where the field is set
+    with refuses(f"{name} is no field of a task; set {field} instead"):
+        type("Own", (MujocoTask,), {**parts, name: value})(engine="native")

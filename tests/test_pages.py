@@ -194,12 +194,10 @@ def test_the_table_of_presets_is_that_of_the_file():
 
 
 FIRST_UNSEEN = {  # where not 600: the preset had changed since
-    ("cpu", "pick_and_place"): 620,
-    ("cpu", "slide"): 620,
     ("gpu", "push"): 750,
-    ("frugal", "push"): 620,
-    ("gpu", "pick_and_place"): 620,
-    **{("gpu", name): 620 for name in ("egg_rotate", "block_rotate_z", "block_rotate_parallel", "block_rotate_xyz")},
+    **dict.fromkeys((("cpu", "pick_and_place"), ("cpu", "slide"), ("frugal", "push")), 620),
+    **{("gpu", name): 620 for name in ("pick_and_place", "egg_rotate")},
+    **{("gpu", f"block_rotate_{name}"): 620 for name in ("z", "parallel", "xyz")},
 }
 
 
@@ -217,7 +215,7 @@ def test_the_table_of_unseen_seeds_is_of_the_file():
     }
     assert shown.keys() == finals.keys()
     for of, values in finals.items():
-        assert len(values) == (6 if of == ("cpu", "slide") else 10)
+        assert len(values) == 10
         error = max(scipy.stats.sem(values), 1e-9)  # all can be 1
         low, high = scipy.stats.t.interval(0.95, len(values) - 1, np.mean(values), error)
         numbers = (min(values), np.median(values), max(values), np.mean(values), low, min(high, 1.0))

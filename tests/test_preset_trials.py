@@ -1,6 +1,7 @@
 """What the pages say of trials of presets, recomputed from their runs by scipy."""
 
 import csv
+import re
 
 import numpy as np
 from conftest import ROOT
@@ -76,10 +77,10 @@ def test_shared_candidates_cost_success():
     assert f"{measure}, behind in eight, and {last} at the end, where they have {ends}." in page("bakeoff_repeats")
     with (ROOT / "docs" / "unseen_runs.csv").open() as file:
         here = [float(row["final"]) for row in csv.DictReader(file) if (row["learner"], row["task"]) == ("cpu", "slide")]
-    ends = f"six seeds end at {np.mean(here):.3f} on `native` and [forty others](bakeoff_repeats.md#cost-of-td_error) at"
+    ends = f"ten seeds end at {np.mean(here):.3f} on `native` and [forty others](bakeoff_repeats.md#cost-of-td_error) at"
     assert f"{ends} {shared[1].mean():.3f} on `warp`" in page("preset_screen")
     below = [np.median(last) - np.min(last) for last in (shared[1], here)]
-    assert "it is {:.3f}, and {:.3f} on the six seeds of two cores".format(*below) in page("presets")
+    assert "it is {:.3f}, and {:.3f} on ten seeds of two cores".format(*below) in page("presets")
 
 
 def test_the_candidate_of_slide_passed():
@@ -98,3 +99,23 @@ def test_the_candidate_of_slide_passed():
     assert f"in {(late[1] > late[0]).sum()} of 20 pairs" in screen
     falls = [f"{np.median(each) - each.min():.3f}" for each in final[::-1]]
     assert "{} below the median, the former preset's {}.".format(*falls) in screen
+
+
+def test_transfers_and_their_averages_are_of_the_rows():
+    """Of fidelity.md: there minus here of each policy, and the averages over the policies of a preset."""
+    text = (ROOT / "docs" / "fidelity.md").read_text()
+    row = r"\| (\w+) +\| `(\w+)`, (\d+) +\| (\d\.\d{3}) \(.*?\) \| (\d\.\d{3}) \(.*?\) \| ([-+]\d\.\d{3}) \("
+    points = {}
+    for task, preset, seed, there, here, shown in re.findall(row, text):
+        assert f"{float(there) - float(here):+.3f}" == shown, (task, preset, seed)
+        points.setdefault((preset, task), []).append(100 * (float(there) - float(here)))
+    assert [len(of) for of in points.values()] == [5, 5, 5, 5, 5, 10]
+    mean = {of: f"{np.mean(values):+.1f}".replace("+0.0", "0.0").replace("-0.0", "0.0") for of, values in points.items()}
+    of_cpu = "; ".join(mean["cpu", task] for task in ("push", "pick_and_place", "slide"))
+    assert f"| `cpu`, Push; PickAndPlace; Slide | {of_cpu} |" in text
+    assert f"| `gpu`, Push; PickAndPlace | {mean['gpu', 'push']}; {mean['gpu', 'pick_and_place']} |" in text
+    assert f"| `gpu`, Slide | {mean['gpu', 'slide']} (" in text
+    lost = f"lose {mean['gpu', 'slide'][1:]} (preset `gpu`) and {mean['cpu', 'slide'][1:]} (`cpu`)"
+    assert lost in " ".join(text.split())
+    most = max(abs(float(mean[preset, task])) for preset in ("gpu", "cpu") for task in ("push", "pick_and_place"))
+    assert f"policies change by at most {most} points there on Push and PickAndPlace" in " ".join(text.split())

@@ -136,26 +136,6 @@ def test_an_episode_with_a_failure_that_the_environment_forgets_is_discarded():
     np.testing.assert_array_equal(outcome.valid, ~breaks)
 
 
-@pytest.mark.parametrize("success", [1.0, jnp.nan])
-def test_a_discarded_episode_counts_in_no_mean(success):
-    """Its start is no success, and a cycle that has only such episodes leaves the epoch's mean return as it is."""
-
-    class Starts(Explodes):
-        def reset(self, key):
-            state = super().reset(key)
-            return dataclasses.replace(state, success=jnp.where(state.step == 0, success, 0.0))
-
-    program = made(Starts(None), dataclasses.replace(SMALL, num_envs=1, cycles_per_epoch=12, replay_size=1000))
-    state, metrics = jax.jit(program.epoch)(program.init(jax.random.key(0), HParams()))
-    kept = int(state.replay.size)
-    assert 0 < kept < 12
-    assert metrics["discarded_episodes"] == 12 - kept
-    assert metrics["reset_success_rate"] == metrics["bad_success"] == 0
-    distance = jnp.linalg.norm(state.replay.episodes.achieved_goal - state.replay.episodes.desired_goal[:, None], axis=-1)
-    returns = -jnp.sum(distance[:kept, 1:] > 0.1, axis=1)
-    assert float(metrics["train_return_mean"]) == pytest.approx(float(returns.mean()), abs=1e-5)
-
-
 def test_without_any_valid_episode_nothing_is_learned():
     program = made(Explodes(jnp.nan, edge=-1.0))
     first = program.init(jax.random.key(0), HParams())
