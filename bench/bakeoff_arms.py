@@ -117,7 +117,7 @@ ARMS = (
     ),
     Arm(
         "curriculum",
-        "transitions",
+        "curriculum",
         {"priority": "curriculum"},
         claim='"improves the state of the art", on Reach and the Hand tasks; users had 0.50 to 0.53 on Slide',
         source="Fang et al. 2019, abstract; its repository, issue 4, and Modular_HER, issue 2",
