@@ -10,18 +10,18 @@ from mjx_dher.types import Array, PyTree
 _NAMES = {jnp.floating: "floats", jnp.integer: "integers", jnp.number: "numbers", jnp.bool_: "booleans"}
 
 
-def array(what: str, value: Any, shape: tuple[int, ...], kind: Any = jnp.floating) -> Array:
+def array(name: str, value: Any, shape: tuple[int, ...], kind: Any = jnp.floating) -> Array:
     """Converts `value` to an array and checks its shape and dtype. Works under tracing, at no run-time cost.
 
     Args:
-      what: name of the value and its symbolic shape, such as "sampler: log weights [T+1]".
+      name: of the value, with its symbolic shape, such as "sampler: log weights [T+1]".
       value: array, number, or nested sequence of numbers.
       kind: expected kind of dtype: `jnp.floating`, `jnp.integer`, `jnp.number` or `jnp.bool_`.
 
     Raises:
       ValueError: names the value, the expected and the given shape and dtype.
     """
-    expected = f"{what} must be {_NAMES[kind]} of shape {list(shape)}"
+    expected = f"{name} must be {_NAMES[kind]} of shape {list(shape)}"
     try:
         result = jnp.asarray(value)
     except (TypeError, ValueError):
@@ -42,7 +42,7 @@ def describe(value: Any) -> str:
 
 
 def kept(method: str, before: PyTree, after: PyTree, leading: int = 0) -> None:
-    """Raises ValueError unless a method keeps its state's structure, dtypes and shapes after `leading` axes, as scans need."""
+    """Raises ValueError unless `after` has the structure, the dtypes and, after `leading` axes, the shapes of `before`."""
     old, new = (
         {jax.tree_util.keystr(path): f"{jnp.result_type(x)}{list(jnp.shape(x)[leading:])}" for path, x in leaves}
         for leaves in map(jax.tree_util.tree_leaves_with_path, (before, after))

@@ -330,7 +330,7 @@ ENVS = {
     "NanSuccess": "success must be finite",
     "RewardOfTwoAxes": r"reward must be a scalar, \[\]",
     "ShorterGoal": r"achieved_goal and desired_goal .* \(2,\) and \(1,\)",
-    "Growing": "must keep structure",
+    "Growing": "must keep structure, shapes and types",
     "Raising": "AttributeError.*no_such_thing",
     "NoActions": "action_size must be an integer of at least 1; it is 0",
     "NoSteps": "episode_length must be an integer of at least 1; it is 0",

@@ -36,7 +36,7 @@ def test_push_learns_in_fewer_steps():
     assert below[112_000] < 0.05 < below[96_000]
     assert presets.preset("frugal", "push").config.total_steps == 112_000
     median = np.median(runs("frugal", "push", "mirror", 112_000, 710)[2])
-    assert f"takes Push to 0.90 in {median:,.0f} steps" in (ROOT / "docs" / "real_robot.md").read_text()
+    assert f"takes Push to 0.90 in {median:,.0f} steps" in page("../real_robot")
     less = with_interval(images - runs("frugal", "push", "mirror", 112_000, 710)[1], "{:.3f} ({:.3f} to {:.3f})")
     assert f"That is {less} less than after 160,000 with images" in page("preset_mirror")
 
@@ -52,7 +52,7 @@ def test_pick_and_place_learns_in_fewer_steps():
     assert f"images take {reached.min():,.0f} to {reached.max():,.0f}, and two end at {lost}." in mirror
     lowest = f"the lowest ends at {images[1].min():.3f}, which is {np.median(images[1]) - images[1].min():.3f} below the median"
     assert lowest in mirror
-    assert f"and PickAndPlace in {first}, the medians" in (ROOT / "docs" / "real_robot.md").read_text()
+    assert f"and PickAndPlace in {first}, the medians" in page("../real_robot")
 
 
 def test_a_shorter_slide_ends_lower():
@@ -103,7 +103,7 @@ def test_the_candidate_of_slide_passed():
 
 def test_transfers_and_their_averages_are_of_the_rows():
     """Of fidelity.md: there minus here of each policy, and the averages over the policies of a preset."""
-    text = (ROOT / "docs" / "fidelity.md").read_text()
+    text = page("../fidelity")
     row = r"\| (\w+) +\| `(\w+)`, (\d+) +\| (\d\.\d{3}) \(.*?\) \| (\d\.\d{3}) \(.*?\) \| ([-+]\d\.\d{3}) \("
     points = {}
     for task, preset, seed, there, here, shown in re.findall(row, text):
@@ -116,6 +116,6 @@ def test_transfers_and_their_averages_are_of_the_rows():
     assert f"| `gpu`, Push; PickAndPlace | {mean['gpu', 'push']}; {mean['gpu', 'pick_and_place']} |" in text
     assert f"| `gpu`, Slide | {mean['gpu', 'slide']} (" in text
     lost = f"lose {mean['gpu', 'slide'][1:]} (preset `gpu`) and {mean['cpu', 'slide'][1:]} (`cpu`)"
-    assert lost in " ".join(text.split())
+    assert lost in text
     most = max(abs(float(mean[preset, task])) for preset in ("gpu", "cpu") for task in ("push", "pick_and_place"))
-    assert f"policies change by at most {most} points there on Push and PickAndPlace" in " ".join(text.split())
+    assert f"policies change by at most {most} points there on Push and PickAndPlace" in text

@@ -236,7 +236,7 @@ BROKEN = {
     "NaN at once": (with_obs("observation", lambda x: x * jnp.nan), "observation .* finite.* after 0 steps"),
     "changes the state": (broken(step=mutating), "step .* state unchanged"),
     "branches": (broken(step=branching), "episode, traced by jax.jit, raises TracerBoolConversionError"),
-    "grows": (broken(step=growing), r"step must keep .* \.count is absent"),
+    "grows": (broken(step=growing), r"step must keep structure, shapes and types; .*\.count is absent"),
     "changes its type": (
         counting(jnp.zeros((), jnp.int32), lambda count: count + 1.0),
         r"step .* \.count .* int32\[\] .* float32\[\]",

@@ -118,10 +118,7 @@ def parse_sweep_args(argv: list[str], report: Callable[[str], None] = lambda tex
     if args.preset == "auto" and args.fleet.ray is None:  # else the preset is known once the cluster is joined
         trials_of(args, preset)  # raises for invalid ones before CUDA starts
         preset = presets.machine_preset()
-    trials = trials_of(args, preset)
-    samplers = dict.fromkeys([*components.COMPONENTS["sampler"], *(trial.sampler for trial in trials)])
-    check_name("baseline, up to its first comma,", args.baseline.partition(",")[0], tuple(samplers))
-    return args, trials
+    return args, trials_of(args, preset)
 
 
 def _without_unread(args: SweepArgs, trials: list[RunSpec], report: Callable[[str], None]) -> SweepArgs:
@@ -149,6 +146,8 @@ def _check(args: SweepArgs) -> None:
     for field, values in vars(args.sweep).items():
         if values == ():
             raise ValueError(f"sweep.{field} must be one or more numbers; got none")
+    samplers = dict.fromkeys([*components.COMPONENTS["sampler"], *args.sampler])
+    check_name("baseline, up to its first comma,", args.baseline.partition(",")[0], tuple(samplers))
     check_count("seeds", args.seeds)
     check_number("first_seed", args.first_seed, f"[0, {2**32 - args.seeds}]")
     if args.lanes is not None:
