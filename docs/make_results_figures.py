@@ -27,6 +27,7 @@ from paper_analysis import (
     median_of,
     number,
     reach,
+    read,
     signed,
     sooner,
     table,
@@ -235,11 +236,13 @@ def blocks(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[
 
 def with_repeats(the_set: Mapping[str, Sweeps], before: Mapping[str, Sweeps]) -> dict[str, Sweeps]:
     """Sweeps with `weighted` and `future` by task: with the paper's cycles, the set's longer ones, and earlier ones."""
+    again = read(DOCS / "break_off.csv")
     today = paper_set.current(the_set)
     found: dict[str, Sweeps] = {}
     for task, sweeps in before.items():
         own = {(OWN, name): curves for (sweep, name), curves in the_set[task].items() if sweep == paper_set.OWN[task]}
-        found[task] = own | {(TODAY, name): curves for (_, name), curves in today[task].items()} | dict(sweeps)
+        longer = {(TODAY, name): curves for (_, name), curves in today[task].items()}
+        found[task] = {**own, **longer, **(again if task == "push" else {}), **sweeps}
     return found
 
 

@@ -185,19 +185,24 @@ def test_what_the_pages_say_of_td_error_and_of_the_break_off_point():
     with (ROOT / "docs" / "break_off.csv").open() as file:
         for row in csv.DictReader(file):
             shown = float(row["success_rate"]), float(row["priority_mean"])
-            curves.setdefault(row["sampler"], {}).setdefault(row["seed"], []).append(shown)
-    found = {s: [np.array(curve)[:, 0] for curve in runs.values()] for s, runs in curves.items()}  # success [29] of each seed
-    start = {s: [next((i for i, (_, p) in enumerate(c) if p >= 0.2), 29) for c in runs.values()] for s, runs in curves.items()}
-    assert sum(epoch < 29 for epoch in start["closest"]) == 4
-    after = {s: np.array([c[b : b + 10].mean() for c, b in zip(found[s], start[s])]) for s in found if s != "closest"}
+            curves.setdefault(row["setting"], {}).setdefault(row["seed"], []).append(shown)
+    found = {s: [np.array(curve)[:, 0] for curve in runs.values()] for s, runs in curves.items()}  # success [50] of each seed
+    start = {s: [next(i for i, (_, p) in enumerate(c) if p >= 0.2) for c in runs.values()] for s, runs in curves.items()}
+    assert all(len(curve) == 50 for of in found.values() for curve in of)
+    after = {s: np.array([c[b : b + 10].mean() for c, b in zip(found[s], start[s])]) for s in found}
     for sampler, mean in after.items():
         epochs = np.array(start[sampler]) + 1
-        row = f"| `{sampler}` | {np.median(epochs):.0f} ({min(epochs)} to {max(epochs)}) | "
+        row = f"| `{sampler}` | {np.median(epochs):g} ({min(epochs)} to {max(epochs)}) | "
         if sampler != "future":
-            gains = (epochs - 1 - start["future"], mean - after["future"])
-            row += "{:+.1f} ({:+.1f} to {:+.1f}) | ".format(*interval(gains[0]))
-            row += "{:+.3f} ({:+.3f} to {:+.3f})".format(*interval(gains[1]))
-        assert row in parted
+            areas = [np.trapezoid(found[name], dx=1 / 49) for name in (sampler, "future")]
+            gains = (mean - after["future"], areas[0] - areas[1])
+            shown = ["{:+.1f} ({:+.1f} to {:+.1f})".format(*interval(epochs - 1 - start["future"]))]
+            shown += ["{:+.3f} ({:+.3f} to {:+.3f})".format(*interval(gain)) for gain in gains]
+            if sampler == "weighted":
+                chances = [scipy.stats.ttest_1samp(gain, 0.0).pvalue for gain in gains]
+                shown[1:] = [f"{cell}, p {chance:.2f}" for cell, chance in zip(shown[1:], chances)]
+            row += " | ".join(shown)
+        assert row in parted, row
 
 
 def test_how_random_weighted_is_stands_in_a_file():

@@ -261,7 +261,8 @@ def test_what_mirror_images_gain_on_a_gpu():
             if (row["task"], row["setting"]) == ("slide", "plain") and row["native"]:
                 native.append((float(row["final"]), float(row["native"])))
             first = 690 if int(row["seed"]) < 710 else 710
-            if row["setting"] not in ("plain", "mirror") or row["env_steps"] in ("112000", "96000"):  # test_preset_trials.py
+            shorter = row["env_steps"] in ("96000", "112000", "192000", "224000")  # test_preset_trials.py
+            if row["setting"] not in ("plain", "mirror") or shorter:
                 continue
             of = runs.setdefault((row["preset"], row["task"], int(row["env_steps"]), first), {"plain": {}, "mirror": {}})
             measure = row["late_success" if row["task"] == "slide" else "mean_success"]
