@@ -252,7 +252,7 @@ def main() -> None:
     tables = blocks(the_set, before)
     for page, names in PAGES.items():
         page.write_text(with_tables(page.read_text(), SCRIPT, {name: tables[name] for name in names}))
-    paper_forest.draw(with_repeats(the_set, before), DOCS / "images" / "paper_forest.png", (OWN, TODAY))
+    paper_forest.draw(with_repeats(the_set, before), DOCS / "images" / "paper_forest.png", (OWN, "break-off", TODAY))
     paper_forest.draw_set(paper_set.compared(the_set), DOCS / "images" / "set_forest.png")
 
 

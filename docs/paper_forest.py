@@ -7,6 +7,7 @@ from paper_analysis import LAST, MARGIN, NAMES, START, THRESHOLDS, Difference, S
 from paper_set import Compared
 
 REPEATED = ("samplers", "fast", "hopper", "hopper again")  # sweeps whose runs are complete
+OWN_CYCLES = ("the paper's cycles", "break-off")
 CLAIMED = {("push", START): (2, 3), ("push", 0.9): (5, 5), ("pick_and_place", START): (2, 3), ("pick_and_place", 0.9): (10, 10)}
 SHOWN = (-0.3, 0.18)  # range of differences in the picture of the set
 WORDS = {
@@ -42,7 +43,7 @@ def epoch_lines(data: Mapping[str, Sweeps], names: tuple[str, ...]) -> list[Line
 
 
 def draw(data: Mapping[str, Sweeps], path: Path, main: tuple[str, ...]) -> None:
-    """Draws the picture. The sweeps in `main` come first; the first one that a task has is darker."""
+    """Draws the picture. The sweeps in `main` come first. Those with the paper's cycles are darker."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(12, 6.2))
@@ -96,13 +97,14 @@ def _short(result: Compared) -> str:
 def _panel(ax, lines: list[Line]) -> None:
     """Draws intervals from top to bottom. Intervals with the same label are close together."""
     y, before, ticks = 0.0, "", []
-    for label, _, d, claimed in lines:
+    for label, sweep, d, claimed in lines:
         y -= 0.32 if label == before else 1.0
         if label != before:
             ticks.append((y, label))
         is_main = label != before
-        color = "#1b62a5" if is_main else "#8fb8de"
-        told = "the paper's cycles, 95 %" if is_main else "other sweeps"
+        has_own = sweep in OWN_CYCLES
+        color = "#1b62a5" if has_own else "#8fb8de"
+        told = "the paper's cycles, 95 %" if has_own else "other sweeps"
         label_of_dot = told if told not in ax.get_legend_handles_labels()[1] else None
         ax.plot([d.low, d.high], [y, y], color=color, linewidth=2.2 if is_main else 1.6, solid_capstyle="butt")
         ax.plot(d.mean, y, "o", color=color, markersize=6 if is_main else 4, label=label_of_dot)
