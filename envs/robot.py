@@ -11,8 +11,11 @@ import numpy as np
 from mjx_dher.contract import robot_interface
 from mjx_dher.envs.engines import Controls, Physics
 from mjx_dher.envs.simulated import SimulatedTask
-from mjx_dher.envs.wrappers import ActionFilter, FrameStack, Wrapper
+from mjx_dher.envs.wrappers import ActionDelay, ActionFilter, FrameStack, ObservationNoise, Wrapper
 from mjx_dher.types import Array, PyTree
+
+
+_BY_HAND = "pass an env without it, and a policy that does the same"
 
 
 class RobotLoop:
@@ -26,7 +29,8 @@ class RobotLoop:
       policy: maps {"observation": [D], "desired_goal": [G]} to an action [A], such as `mjx_dher.load_policy(path)`.
 
     Raises:
-      ValueError: it is no such environment, or the policy was trained with another period, controls or observation.
+      ValueError: it is no such environment, it has a wrapper, `advance`, `step`, `observed` or `observe_goal` of your own, or
+        the policy was trained with another period, controls or observation.
     """
 
     def __init__(self, env: Any, policy: Callable[[Mapping[str, Any]], np.ndarray]):
@@ -35,9 +39,13 @@ class RobotLoop:
         while isinstance(task, Wrapper):
             if isinstance(task, ActionFilter | FrameStack):
                 self._wrappers.insert(0, task)  # the innermost first
+            elif not isinstance(task, ActionDelay | ObservationNoise):
+                raise ValueError(f"a loop does not know what {type(task).__name__} does; {_BY_HAND}")
             task = task.env
         if not isinstance(task, SimulatedTask):
             raise ValueError(f"env must be a task from an MJCF, or wrappers around one; got {type(task).__name__}")
+        if unknown := {"advance", "step", "observed", "observe_goal"} & set(task._own):
+            raise ValueError(f"a loop does not know what {type(task).__name__}.{min(unknown)} does; {_BY_HAND}")
         self.task, self.policy = task, policy
         trained, own = getattr(policy, "interface", None) or {}, json.loads(json.dumps(robot_interface(task)))
         if "own" in trained and trained["own"] != own.get("own", []):  # policies of older versions lack it

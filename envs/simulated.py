@@ -19,7 +19,9 @@ from mjx_dher.validation import check_count, check_number
 
 # Methods that `describe` describes, with its entries that are left out if a class replaces a method and not `describe`.
 _DESCRIBED = {
-    **{"controls": ["controls"], "advance": ["controls"], "observe": ["layout", "joints", "sensors"]},
+    **{name: ["controls"] for name in ("controls", "advance", "step")},
+    **{name: ["layout", "joints", "sensors"] for name in ("observe", "observed")},
+    "observe_goal": ["layout", "joints", "sensors", "goal"],
     **{name: ["goal"] for name in ("achieved", "sample_goal", "goal_distance", "reached")},
 }
 

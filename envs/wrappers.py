@@ -58,6 +58,8 @@ class Wrapper:
             if not vars(type(self)).get("keeps_mirror"):
                 raise AttributeError(f"the inner mirror may contradict {type(self).__name__}, unless it sets keeps_mirror")
             return mirror.own(self.env)
+        if name == "robot_interface" and type(self).__module__ != __name__:
+            return {"own": [type(self).__name__]}
         own = getattr(self.env, name)  # with_goal and with_object only if the environment has them
         return {"with_goal": self._with_goal, "with_object": self._with_object}.get(name, own)
 

@@ -29,8 +29,6 @@ from mjx_dher.runs import driver, program
 from mjx_dher.runs.folder import fingerprint, reading, results, run_folder
 from mjx_dher.sweeps import comparison, grid, tables
 from mjx_dher.system.files import FolderError
-from mjx_dher.testing import check_env
-from mjx_dher.testing.trial import ComponentError
 from point_mass import PointMass
 
 SPEC = RunSpec(env="point_mass:PointMass", config=TINY)
@@ -263,33 +261,6 @@ def test_equal_arguments_of_other_types_and_reloaded_modules_are_other_environme
     (tmp_path / "moded.py").write_text(f"{body}        super().__init__(13)\n        self.mode = mode  # changed\n")
     importlib.reload(moded)
     assert gym.GymEnv("moded:Mode", mode=1).unwrapped._compiled.env.episode_length == 13
-
-
-class Seen(PointMass):
-    """Its observation has the way to the goal, which relabelling would leave as it is."""
-
-    observation_size = 4
-    with_goal = None
-
-    def reset(self, key):
-        return self._seen(super().reset(key))
-
-    def step(self, state, action):
-        return self._seen(super().step(state.replace(obs={**state.obs, "observation": state.obs["achieved_goal"]}), action))
-
-    def _seen(self, state):
-        way = state.obs["desired_goal"] - state.obs["achieved_goal"]
-        return state.replace(obs={**state.obs, "observation": jnp.concatenate([state.obs["achieved_goal"], way])})
-
-
-class NoGoal(PointMass):
-    with_goal = None
-
-
-def test_an_observation_that_has_the_goal_is_named():
-    check_env(NoGoal())
-    with refuses("observation", "must not depend on the desired goal", error=ComponentError):
-        check_env(Seen())
 
 
 def test_numbers_of_a_run_without_a_folder_are_checked_and_bounds_are_finite():

@@ -13,6 +13,8 @@ import pytest
 from conftest import refuses
 from test_odd_robots import Reach
 
+from mjx_dher.contract import robot_interface
+from mjx_dher.envs import wrappers
 from mjx_dher.envs.controls import Control
 from mjx_dher.envs.fetch import Push
 from mjx_dher.envs.goals import Goal
@@ -63,7 +65,6 @@ SEEN = ["layout", "joints", "sensors"]
     [
         (Longer, SEEN, "observe"),
         (Slower, ["controls"], "controls"),
-        (own(advance=lambda self, *args: Reach.advance(self, *args)), ["controls"], "advance"),
         (own(achieved=lambda self, physics: physics.qpos[:3]), ["goal"], "achieved"),
         (own(sample_goal=lambda self, key: jnp.zeros(3)), ["goal"], "sample_goal"),
         (own(goal_distance=lambda self, achieved, desired: jnp.sum(achieved - desired, -1)), ["goal"], "goal_distance"),
@@ -88,6 +89,38 @@ def test_a_policy_file_leaves_out_what_own_methods_may_contradict(task, lost, ow
     policy.interface = {**plain, "dt": 0.05}
     with refuses("dt", "policy"):
         RobotLoop(env, policy)
+
+
+class Halved(wrappers.Wrapper):
+    def act(self, memory, action):
+        return memory, 0.5 * action
+
+
+@pytest.mark.parametrize(
+    ("name", "lost"),
+    [
+        ("advance", ["controls"]),
+        ("step", ["controls"]),
+        ("observed", SEEN),
+        ("observe_goal", [*SEEN, "goal"]),
+        ("Halved", ["controls", *SEEN, "goal"]),
+    ],
+)
+def test_a_loop_refuses_what_it_would_not_do(name, lost):
+    task = own(**{name: lambda self, *args: getattr(Reach, name)(self, *args)})
+    env = Halved(made(Reach)) if name == "Halved" else task("native")
+    assert robot_interface(env).keys() == {"dt", *made(Reach).robot_interface.keys() - set(lost), "own"}
+    assert robot_interface(env)["own"] == [name]
+    with refuses(name, "policy"):
+        RobotLoop(wrappers.ActionDelay(env, 1), lambda obs: np.zeros(2))
+
+
+def test_a_loop_applies_shipped_wrappers_and_leaves_out_noise_and_delay():
+    wrapped = wrappers.ActionFilter(wrappers.ActionDelay(wrappers.ObservationNoise(made(Reach), 0.5), 2), 0.0)
+    assert robot_interface(wrapped) == robot_interface(made(Reach))
+    env, measured = made(Reach), np.asarray(made(Reach).start.physics.qpos)
+    loops = [RobotLoop(each, lambda obs: np.tanh(obs["observation"][:2])) for each in (env, wrapped)]
+    np.testing.assert_array_equal(*(loop(measured, np.zeros(env.model.nv), np.zeros(3)).ctrl for loop in loops))
 
 
 def test_an_own_observation_may_be_longer_and_its_class_may_vouch_for_the_layout():

@@ -60,6 +60,8 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
     actions = jax.device_get(actions)
     _check_mirror(env, jax.tree.map(lambda x: x[:-1], states.obs), actions, valid[:-1], tolerance)
     _check_alone(env, keys, actions, states, tolerance)
+    if not callable(getattr(env, "with_goal", None)):
+        _check_without_goal(states.obs, valid, tolerance)
     _check_rewards(env, spec, played, valid, tolerance)
     contract.check_steps(env)
 
@@ -190,6 +192,17 @@ def _check_goal_is_apart(step: Callable[[Any], dict[str, Any]], state: Any, goal
     for name in (name for name in own if name.startswith("observation")):
         same = np.allclose(own[name], changed[name], rtol=tolerance, atol=tolerance, equal_nan=True)
         expect(same, f"{name} must not depend on the desired goal, because relabelling replaces the goal alone; it does")
+
+
+def _check_without_goal(obs: Any, valid: NDArray, tolerance: float) -> None:
+    """Checks that observations of the states in the mask `valid` [T+1, N] have no goal, which a state may keep elsewhere, too."""
+    observation, achieved, desired = (jax.tree.map(lambda x: x[valid], obs[name]) for name in ("observation", *GOALS))
+    moves = np.ptp(desired, axis=0).any()
+    parts = {"desired_goal": desired, "desired_goal - achieved_goal": desired - achieved}
+    for what, part in {**parts, "achieved_goal - desired_goal": achieved - desired}.items():
+        for at in _places(observation, part, tolerance) if moves else ():
+            where = f"observation[{at}:{at + part.shape[1]}]"
+            expect(False, f"{where} must not be {what}, because relabelling replaces the goal alone; in every state, it is")
 
 
 def _check_mirror(env: Any, obs: Any, actions: NDArray, valid: NDArray, tolerance: float) -> None:
