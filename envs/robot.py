@@ -14,7 +14,6 @@ from mjx_dher.envs.simulated import SimulatedTask
 from mjx_dher.envs.wrappers import ActionDelay, ActionFilter, FrameStack, ObservationNoise, Wrapper
 from mjx_dher.types import Array, PyTree
 
-
 _BY_HAND = "pass an env without it, and a policy that does the same"
 
 

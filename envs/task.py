@@ -244,17 +244,23 @@ def _folder(task: type) -> Path:
 
 
 def _check_names(task: type) -> None:
-    """Raises ValueError if a task class has a value under an argument's or result's name, or under nearly a field's name."""
+    """Raises ValueError if a task class has a value under an argument's or result's name, or under nearly a field's name, or a
+    function under nearly the name of a method that it does not have.
+    """
     annotated = SimulatedTask.__annotations__ | MujocoTask.__annotations__
     fields = [name for name in annotated if name[0] != "_" and name not in ("threshold", "goal_distance")]
     arguments = inspect.signature(SimulatedTask).parameters.keys() - fields
     owners = task.__mro__[: task.__mro__.index(MujocoTask)]
+    methods = {name for name in dir(MujocoTask) if name[0] != "_" and callable(getattr(MujocoTask, name))} | {"goal_distance"}
+    kept = methods - {name for owner in owners for name in vars(owner)}  # from the base class
     kinds = {"control": Control, "goal": Goal, "start": Start}
     left = {field: kind for field, kind in kinds.items() if not any(field in vars(owner) for owner in owners)}
     for owner in owners:
         if elsewhere := sorted(vars(owner).keys() & _ELSEWHERE.keys()):
             raise ValueError(f"{owner.__name__}.{elsewhere[0]} is no field of a task; set {_ELSEWHERE[elsewhere[0]]} instead")
-        for name in vars(owner).keys() - fields - vars(MujocoTask).keys():
+        for name in vars(owner).keys() - fields - vars(MujocoTask).keys() - methods:
+            if callable(vars(owner)[name]) and name[0] != "_" and (near := hint(name, kept, cutoff=0.9)):
+                raise ValueError(f"{owner.__name__}.{name} is no method of a task{near}")
             if field := next((field for field, kind in left.items() if isinstance(vars(owner)[name], kind)), None):
                 raise ValueError(f"{owner.__name__}.{name} is no field of a task; set {field} instead")
             near = hint(name, fields, cutoff=0.85)

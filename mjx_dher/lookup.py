@@ -24,8 +24,9 @@ def escaped(text: str) -> str:
 
 
 def command_name() -> str:
-    """Name of the command that the user started: mjx-dher if it is installed, else train.py."""
-    return "mjx-dher" if Path(sys.argv[0]).stem == "mjx-dher" else "train.py"
+    """The command that the user started: mjx-dher if it is installed, else as a module or file."""
+    name = Path(sys.argv[0]).stem
+    return {"mjx-dher": name, "__main__": "python -m mjx_dher"}.get(name, "python train.py")
 
 
 def check_name(field: str, value: str, allowed: Iterable[str], custom: bool = False) -> None:

@@ -300,7 +300,7 @@ def test_killed_and_stopped_runs_end_like_the_one_that_was_not(tmp_path):
     assert (second.returncode, stderr) == (128 + signal.SIGTERM, ""), stdout
     newest = run_folder.checkpoints(out)[0]
     assert f"saved {newest}" in stdout
-    assert f"`train.py resume {out}` resumes" in stdout
+    assert f"`python train.py resume {out}` resumes" in stdout
     assert len(table(out)) - 1 == int(newest.name[-6:])
     third = start("resume", out)
     stdout, stderr = third.communicate(timeout=200)

@@ -64,7 +64,7 @@ def test_every_command_has_a_help_that_names_it(capsys):
     for name in COMMANDS:
         assert cli.main([name, "--help"]) == 0
         usage = capsys.readouterr().out.split("\n")[0]
-        assert usage.startswith("usage: train.py" + ("" if name == "train" else f" {name}")), usage
+        assert usage.startswith("usage: python train.py" + ("" if name == "train" else f" {name}")), usage
 
 
 def test_the_help_names_the_preset_of_its_defaults(capsys, tmp_path, trained):

@@ -18,7 +18,7 @@ import mjx_dher
 from mjx_dher import HParams, Options, RunSpec, cli
 from mjx_dher.cli.common import Screen
 from mjx_dher.learners import ddpg
-from mjx_dher.runs import driver
+from mjx_dher.runs import driver, program
 from mjx_dher.runs.folder import checkpoint, fingerprint, lane_checkpoints, reading
 from mjx_dher.runs.folder.lane_checkpoints import Schedule
 from mjx_dher.sweeps import comparison, tables
@@ -70,6 +70,36 @@ def test_a_run_folder_that_is_moved_while_it_trains_is_named(tmp_path, monkeypat
     assert "cannot write a checkpoint" in told.out
     assert f"error: {run} was moved or deleted during training" in told.err
     assert (shown, run.exists()) == ([1], False)
+
+
+def remade(run):
+    run.rename(run.with_name("moved"))
+    run.mkdir()
+
+
+def edited(run):
+    (run / "config.json").write_text((run / "config.json").read_text().replace("weighted", "future"))
+
+
+@pytest.mark.parametrize(
+    ("change", "at", "told"),
+    [
+        (remade, 1, "was moved or deleted"),
+        (remade, 3, "was moved or deleted"),  # during the last evaluation
+        (edited, 1, "lost a file or got another config.json"),
+        (lambda run: (run / "metrics.csv").unlink(), 1, "lost a file or got another config.json"),
+    ],
+)
+def test_a_run_folder_that_is_remade_while_it_trains_gets_no_result(tmp_path, monkeypatch, capsys, change, at, told):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    run, evaluate = tmp_path / "run", program.evaluate
+    if at == 3:
+        monkeypatch.setattr(program, "evaluate", lambda *args: (evaluate(*args), change(run))[0])
+    else:
+        monkeypatch.setattr(Screen, "show", lambda self, specs, progress: progress.epoch == at and change(run))
+    assert cli.main([*FLAGS, "--checkpoint-every", "0", "--out", str(run)]) == 2
+    assert f"error: {run} {told} during training" in capsys.readouterr().err
+    assert not (run / "result.json").exists()
 
 
 def breaking():

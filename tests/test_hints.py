@@ -60,9 +60,10 @@ def test_nothing_of_the_progress_is_cut_on_a_narrow_terminal(width):
 
 
 def test_messages_name_the_program_that_was_started(monkeypatch):
-    assert lookup.command_name() == "train.py"
-    monkeypatch.setattr(sys, "argv", [os.path.join("bin", "mjx-dher")])
-    assert lookup.command_name() == "mjx-dher"
+    assert lookup.command_name() == "python train.py"
+    for path, command in ((("bin", "mjx-dher"), "mjx-dher"), (("mjx_dher", "__main__.py"), "python -m mjx_dher")):
+        monkeypatch.setattr(sys, "argv", [os.path.join(*path)])
+        assert lookup.command_name() == command
 
 
 HUGE = str(10**20)

@@ -259,6 +259,8 @@ def without(name):
             for name in ("size", "threshold", "achieved", "sample", "distance")
         ),
         ({"achieved": lambda self, physics: physics.qpos[:2]}, ("achieved", "[3]", "[2]")),
+        ({"goal_distances": lambda self, achieved, desired: 0}, ("goal_distances", "'goal_distance'")),
+        ({"compute_rewards": Reach.compute_reward}, ("compute_rewards", "'compute_reward'")),
         ({"observe": lambda self, physics: physics.qpos[None]}, ("observe", "vector")),
         ({"observe": lambda self, physics: [physics.qpos]}, ("observe", "array", "list")),
     ],
@@ -266,6 +268,11 @@ def without(name):
 def test_what_an_own_task_gets_nearly_right_is_named(declared, parts):
     with refuses(*parts):
         type("Own", (Reach,), declared)("native")
+
+
+def test_helpers_of_own_methods_may_have_near_names():
+    zero = lambda self, *args: jnp.zeros(())  # noqa: E731
+    own(goal_distances=zero, goal_distance=zero, _sample_goals=zero, observe_box=zero)("native")
 
 
 JOINT = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="j" type="{}"/><geom size="0.1"/></body></worldbody>

@@ -65,16 +65,16 @@ class _Watch:
     folders: Sequence[Path]
     report: Callable[[str], None]
     failed: dict[int, tuple[int, str]]  # epoch and reason of each failed lane; updated in place
+    configs: Sequence[bytes]  # contents of config.json, in the process that writes
     warned: set[tuple[int, str]] = dataclasses.field(default_factory=set)
 
     def look(self, progress: Progress, rows: Sequence[dict[str, float]]) -> None:
-        """Records the lanes that failed in an epoch, and reports each kind of warning once. Raises FolderError if a folder
-        is gone, because writing to the open metrics.csv raises nothing then.
+        """Records the lanes that failed in an epoch, and reports each kind of warning once. Raises FolderError as
+        `check_folders` does.
         """
+        self.check_folders()
         finite = np.atleast_1d(progress.finite)
         for lane, (spec, folder, row) in enumerate(zip(self.specs, self.folders, rows)):
-            if processes.leads() and not folder.is_dir():
-                raise files.FolderError(f"{folder} was moved or deleted during training, so nothing more can be saved")
             name = f"{folder.name}: " if len(self.specs) > 1 else ""
             if lane in self.failed:
                 continue
@@ -86,6 +86,11 @@ class _Watch:
                 if (lane, kind) not in self.warned:
                     self.warned.add((lane, kind))
                     self.report(f"{name}epoch {progress.epoch}: {text}")
+
+    def check_folders(self) -> None:
+        """Raises FolderError if a folder is gone or replaced, because writing to the open metrics.csv raises nothing then."""
+        for folder, config in zip(self.folders, self.configs):
+            run_folder.check_in_place(folder, config)
 
 
 def train_runs(
@@ -213,13 +218,13 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
     start = checkpoints.restore(functools.partial(program.compiled.init, keys, hparams), will_save)
     trained = _is_trained(session.env, specs[0], folders[0], [start.epoch])
     report_once = functools.cache(session.report)
-    watch = _Watch(specs, folders, session.report, checkpoints.failed)
     with contextlib.ExitStack() as stack:
-        ended = [min(start.epoch, watch.failed.get(lane, (start.epoch + 1,))[0] - 1) for lane in range(len(specs))]
+        ended = [min(start.epoch, checkpoints.failed.get(lane, (start.epoch + 1,))[0] - 1) for lane in range(len(specs))]
         own = [*zip(ended, specs, folders, runs)] if processes.leads() else []
         with run_folder.kept_unless_opened(folders if own else ()):
             logs = [_open(stack, session, program.lanes, *run) for run in own]
-        success = processes.broadcast(lambda: _success_rates(folders[0], start.epoch))  # for stop_at, which needs a single run
+        watch = _Watch(specs, folders, session.report, checkpoints.failed, [run_folder.config_bytes(row[2]) for row in own])
+        success = processes.broadcast(lambda: run_folder.success_rates(folders[0], start.epoch))  # for stop_at, of a single run
         schedule = Schedule(options.checkpoint_every)
         trained |= options.is_reached(success)
         progress = loop.resumed(session.env, specs[0].config, start)
@@ -249,21 +254,12 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
         session.report(f"stop_at {options.stop_at:g} is reached after epoch {progress.epoch} of {progress.num_epochs}")
     if options.keep_end and not watch.failed:
         checkpoints.try_save(progress)
-    ended_runs = _finish(session, program, progress, specs, folders, runs, watch.failed)
+    ended_runs = _finish(session, program, progress, runs, watch)
     if len(watch.failed) < len(specs):
         checkpoints.clear(options.keep_end)
     if not trained:
         session.on_epoch(specs, progress)
     return ended_runs
-
-
-def _success_rates(folder: Path, ended: int) -> list[float]:
-    """Success rates of the epochs that ended before the run resumed."""
-    if not ended:
-        return []
-    from mjx_dher.runs.folder import results
-
-    return [row["success_rate"] for row in results.read_metrics(folder)]
 
 
 def _open(
@@ -310,21 +306,17 @@ def _save_policy(env: Env, program: Program, learner: Any, spec: RunSpec, folder
 
 
 def _finish(
-    session: _Session,
-    program: Program,
-    progress: Progress,
-    specs: Sequence[RunSpec],
-    folders: Sequence[Path],
-    runs: Sequence[dict[str, Any]],
-    failed: dict[int, tuple[int, str]],
+    session: _Session, program: Program, progress: Progress, runs: Sequence[dict[str, Any]], watch: _Watch
 ) -> list[Result]:
     """Writes the policies and results of ended runs. result.json comes last, because it marks a run as done."""
     outcome: Any = None
+    specs, folders, failed = watch.specs, watch.folders, watch.failed
     learners = processes.collect(progress.state.learner)
     if len(failed) < len(specs):
         keys, _ = program_lib.stack(specs, program.choices, program.lanes)
         episodes = session.options.final_episodes
         outcome = program_lib.evaluate(session.env, program, progress.state, keys, episodes)
+    watch.check_folders()
     results = []
     for lane, (spec, folder) in enumerate(zip(specs, folders)):
         epoch, reason = failed.get(lane, (progress.epoch, ""))

@@ -195,7 +195,7 @@ def _check_goal_is_apart(step: Callable[[Any], dict[str, Any]], state: Any, goal
 
 
 def _check_without_goal(obs: Any, valid: NDArray, tolerance: float) -> None:
-    """Checks that observations of the states in the mask `valid` [T+1, N] have no goal, which a state may keep elsewhere, too."""
+    """Checks that observations of the states in the mask `valid` [T+1, N] have no goal that the state keeps elsewhere, too."""
     observation, achieved, desired = (jax.tree.map(lambda x: x[valid], obs[name]) for name in ("observation", *GOALS))
     moves = np.ptp(desired, axis=0).any()
     parts = {"desired_goal": desired, "desired_goal - achieved_goal": desired - achieved}

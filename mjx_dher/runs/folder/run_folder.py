@@ -146,6 +146,31 @@ def save_policy(path: Path, policy: Any, run: Mapping[str, Any]) -> None:
     policy.save(path / POLICY_FILE, settings=np.frombuffer(json.dumps(run).encode(), np.uint8))
 
 
+def success_rates(path: Path, ended: int) -> list[float]:
+    """Success rates of the epochs that ended before the run in `path` resumed."""
+    if not ended:
+        return []
+    from mjx_dher.runs.folder import results
+
+    return [row["success_rate"] for row in results.read_metrics(path)]
+
+
+def config_bytes(path: Path) -> bytes:
+    """Content of config.json."""
+    return (path / CONFIG_FILE).read_bytes()
+
+
+def check_in_place(path: Path, config: bytes) -> None:
+    """Raises FolderError if `path` has no metrics.csv, or not the `config` of the run that trains in it."""
+    try:
+        same = config_bytes(path) == config
+        changed = None if same and (path / METRICS_FILE).exists() else "lost a file or got another config.json"
+    except (FileNotFoundError, NotADirectoryError):
+        changed = "was moved or deleted"
+    if changed:
+        raise FolderError(f"{path} {changed} during training, so nothing more can be saved")
+
+
 @contextlib.contextmanager
 def kept_unless_opened(folders: Sequence[Path]) -> Iterator[None]:
     """Removes results, because what they describe will change. If an exception ends the block, the folders are as before."""
