@@ -61,14 +61,15 @@ def summarize(success: Any, reset_success: Any, ret: Any, valid: Any = None) -> 
       success: success at the last step [N], 0 or 1.
       reset_success: success at the reset [N], 0 or 1.
       ret: returns [N].
-      valid: mask [N]. Other episodes count as failures and have no return. Default: all.
+      valid: mask [N]. Other episodes are discarded: they are failures and have no return. Default: all.
 
     Raises:
       ValueError: a success is neither 0 nor 1.
     """
     if wrong := [float(x) for x in np.ravel((success, reset_success)) if x not in (0.0, 1.0)]:
         raise ValueError(f"success must be 0 or 1; of {np.size(success)} episodes it is {wrong[0]:g} in {len(wrong)}")
-    ret = np.asarray(ret, np.float64)[slice(None) if valid is None else np.asarray(valid, bool)]
+    valid = np.ones(len(success), bool) if valid is None else np.asarray(valid, bool)
+    ret, discarded = np.asarray(ret, np.float64)[valid], int(np.sum(~valid))
     low, high = wilson_interval(int(np.sum(success)), len(success))
     return {
         "episodes": len(success),
@@ -77,6 +78,7 @@ def summarize(success: Any, reset_success: Any, ret: Any, valid: Any = None) -> 
         "success_high": high,
         "reset_success_rate": float(np.mean(reset_success, dtype=np.float64)),
         "return_mean": float(ret.mean()) if len(ret) else math.nan,
+        **({"discarded_episodes": discarded} if discarded else {}),
     }
 
 

@@ -4,6 +4,7 @@ without discarded episodes.
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import jax
@@ -13,13 +14,16 @@ import pytest
 from configs import SMALL, TINY
 from conftest import refuses
 from flax import struct
+from rich.console import Console
 
 import mjx_dher.gym
 from mjx_dher import RunSpec, make_train, relabel, replay, samplers, trainer
+from mjx_dher.cli.common import print_summary
 from mjx_dher.config import HParams
 from mjx_dher.context import Context
 from mjx_dher.contrib import generators
 from mjx_dher.demonstrations import read_demonstrations, write_demonstrations
+from mjx_dher.evaluate import play_policy, summarize
 from mjx_dher.policy import learner_policy
 from mjx_dher.priorities import make, whole
 from mjx_dher.rollout import rollout, where_each
@@ -283,3 +287,16 @@ def test_a_discarded_episode_counts_in_no_mean(success):
     distance = jnp.linalg.norm(state.replay.episodes.achieved_goal - state.replay.episodes.desired_goal[:, None], axis=-1)
     returns = -jnp.sum(distance[:kept, 1:] > 0.1, axis=1)
     assert float(metrics["train_return_mean"]) == pytest.approx(float(returns.mean()), abs=1e-5)
+
+
+@pytest.mark.parametrize("edge", [0.2, 2.0])
+def test_discarded_episodes_of_a_policy_are_counted_and_told(edge, capsys):
+    still = SimpleNamespace(forward=lambda observation, goal, xp: xp.zeros_like(goal))
+    outcome = play_policy(Explodes(jnp.nan, edge), still, 50, seed=1)
+    summary, broken = summarize(*outcome[:4]), int(np.sum(~outcome.valid))
+    assert (broken > 5) == (edge < 1)
+    assert summary.get("discarded_episodes", 0) == broken
+    print_summary(summary, Console(width=500))
+    told = capsys.readouterr().out
+    assert ("discarded" in told) == (broken > 0)
+    assert broken == 0 or f"; {broken} episodes were discarded" in told

@@ -71,6 +71,12 @@ def test_the_command_line_sweeps_and_goes_on_and_plots(tmp_path, point_mass, cap
     names = [f"point_mass_{name}.{end}" for name in ("curves", "thresholds", "comparison") for end in ("png", "svg")]
     assert sorted(written) == sorted(["comparison.csv", *names])
     assert min(written[name] for name in names) > 5000
+    before = (tmp_path / "sweep" / "comparison.csv").read_bytes()
+    for command in ("plot", "report"):
+        assert cli.main([command, str(tmp_path / "sweep"), "--baseline", "weigted"]) == 2
+        assert "error: baseline must be one of future, " in capsys.readouterr().err
+        assert cli.main([command, str(tmp_path / "sweep"), "--baseline", "weighted, her_k 8"]) == 0
+    assert before != (tmp_path / "sweep" / "comparison.csv").read_bytes()
 
 
 def test_a_folder_that_cannot_be_written_to_is_reported_before_anything_compiles(tmp_path, point_mass, capsys, monkeypatch):

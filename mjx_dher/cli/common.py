@@ -89,10 +89,12 @@ def join(distributed: bool, described: Mapping[str, Any], console: Console) -> C
 
 def print_summary(summary: dict[str, Any], console: Console) -> None:
     """Prints the result of `evaluate.summarize`."""
+    discarded = summary.get("discarded_episodes", 0)
     console.print(
         f"success {summary['success_rate']:.3f} (95 % interval {summary['success_low']:.3f} to {summary['success_high']:.3f},"
         f" {summary['episodes']} episodes); already at reset {summary['reset_success_rate']:.3f};"
         f" mean return {summary['return_mean']:.2f}"
+        + (f"; {discarded} episodes were discarded, which are failures without a return" if discarded else "")
     )
 
 

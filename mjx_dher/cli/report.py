@@ -87,6 +87,7 @@ def _plot_sweep(args: PlotArgs, console: Console) -> int:
 
     (folder,) = args.folders
     by_env = comparison.groups(tables.read(folder))
+    comparison.check_baseline(by_env, args.baseline)
     out = args.out or folder
     files.make_folder(out)
     rows = compare(out, by_env, args.baseline, args.threshold, console)
@@ -128,7 +129,10 @@ def report_command(argv: list[str], console: Console) -> int:
     sweep = grid.is_sweep((args.folder,))
     if args.out is not None:
         files.check_file(args.out, (".html",), args.overwrite)
-    from mjx_dher.sweeps import report
+    from mjx_dher.sweeps import comparison, report, tables
+
+    if sweep:
+        comparison.check_baseline(comparison.groups(tables.read(args.folder)), args.baseline)
 
     out = args.out or args.folder / report.REPORT
     settings.check_writable(out.parent)

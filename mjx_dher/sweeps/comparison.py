@@ -2,14 +2,14 @@
 
 import csv
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mjx_dher import stats
+from mjx_dher import lookup, stats
 from mjx_dher.components import COMPONENTS, reads
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.runs.folder.run_folder import FAILED
@@ -168,6 +168,13 @@ def compare(settings: list[Group], baseline: str, threshold: float) -> list[Row]
     for i, p in zip(tested, corrected):
         rows[i] = rows[i]._replace(p_corrected=float(p))
     return rows
+
+
+def check_baseline(by_env: Mapping[str, Sequence[Group]], baseline: str) -> None:
+    """Raises ValueError unless a setting has this sampler or label. The default, `future`, may be missing."""
+    settings = [group for groups in by_env.values() for group in groups]
+    names = dict.fromkeys(["future", *(group.sampler for group in settings), *(group.label for group in settings)])
+    lookup.check_name("baseline", baseline, names)
 
 
 def _baseline_of(group: Group, settings: list[Group], baseline: str) -> Group | None:

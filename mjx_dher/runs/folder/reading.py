@@ -52,7 +52,13 @@ RESULT: Form = {
     "wall_seconds": _AMOUNT,
 }
 _RATES: Form = dict.fromkeys(("success_rate", "success_low", "success_high", "reset_success_rate"), _SHARE)
-RESULT_FINISHED: Form = {**RESULT, **_RATES, "episodes": _COUNT, "return_mean?": (float, "(-inf, inf)")}
+RESULT_FINISHED: Form = {
+    **RESULT,
+    **_RATES,
+    "episodes": _COUNT,
+    "discarded_episodes?": _COUNT,
+    "return_mean?": (float, "(-inf, inf)"),
+}
 ROW: Form = {  # of metrics.csv; other metrics of learners can be any number
     **dict.fromkeys(("epoch", "env_steps", "updates"), _COUNT),
     "wall_seconds": _AMOUNT,
