@@ -77,6 +77,27 @@ def test_eval_and_resume_say_which_file_changed_since(own, tmp_path, capsys):
     assert "has changed" not in capsys.readouterr().out
 
 
+BROKEN = """
+class Mine(PointMass):
+    def step(self, state, action):
+        raise KeyError("boo")
+"""
+
+
+def test_eval_and_resume_name_the_line_of_a_task_that_no_longer_steps(own, tmp_path, capsys):
+    train(tmp_path / "run", dataclasses.replace(SPEC, env="own_task:Mine"), until=2)
+    own(BROKEN)
+    del sys.modules["own_task"]
+    assert cli.main(["eval", str(tmp_path / "run"), "--episodes", "2"]) == 2
+    told = capsys.readouterr().err
+    place = f"own_task.py, line {(TASK + BROKEN[: BROKEN.index('raise')]).count(chr(10)) + 1})"
+    assert "an episode raises KeyError: 'boo'" in told
+    assert place in told
+    status, text = resume(tmp_path / "run", capsys)
+    assert status == 2
+    assert place in text
+
+
 def test_only_an_environment_has_files_of_a_model():
     for field in ("sampler", "metric", "networks", "env"):
         told = fingerprint.file_of(field, "own_task.py 3fa9c1d2e4")

@@ -108,17 +108,19 @@ def eval_command(argv: list[str], console: Console) -> int:
 def _evaluate(args: EvalArgs, path: Path, run: RunSpec, policy: Any, env: Any, console: Console) -> None:
     """Plays the policy of one run and prints the summary."""
     from mjx_dher.evaluate import play_policy, summarize
+    from mjx_dher.testing.trial import attempt
 
     physics = run_folder.engine_name(env)
+    play = lambda: summarize(*attempt("an episode", play_policy, env, policy, args.episodes, args.seed)[:4])  # noqa: E731
     if args.json:
         head = {"run": str(path), "env": run.env, "env_kwargs": run.env_arguments, "physics": physics, "seed": args.seed}
-        summary = summarize(*play_policy(env, policy, args.episodes, args.seed)[:4])
+        summary = play()
         plain = {name: None if isinstance(x, float) and not math.isfinite(x) else x for name, x in summary.items()}
         print(json.dumps({**head, **plain}), flush=True)
         return
     where = f"{path}: " if len(args.runs) > 1 else ""
     console.print(f"{where}{run.env}: {args.episodes} episodes, seed {args.seed}, physics {physics} ...", soft_wrap=True)
-    common.print_summary(summarize(*play_policy(env, policy, args.episodes, args.seed)[:4]), console)
+    common.print_summary(play(), console)
 
 
 @dataclasses.dataclass(frozen=True)

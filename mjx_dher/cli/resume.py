@@ -62,6 +62,7 @@ def resume_command(argv: list[str], console: Console) -> int:
         run, options = _to_resume(args, asked.options.stop_at, content, screen)
         prepare()
         env = make_env(run, args.engine or (content["physics"] if envs.takes_engine(run.env) else None))
+        common.try_components([run], screen, env)
         devices = content.get("devices", 1) if args.devices is None else args.devices
         return train_into(env, run, args.run, options, args.curve, screen, devices)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -42,7 +43,7 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
       that reaches it differs only in reward and success: `terminal` holds for every goal, and observations do not have it.
 
     Args:
-      env: the environment. Its method `check()`, if present, is called at the end.
+      env: the environment. Its `describe()` and `check()`, if present, are called at the end.
       seed: seed of starts, goals and actions.
       tolerance: largest difference between results that should be equal, relative to the larger of 1 and the value.
 
@@ -63,7 +64,9 @@ def check_env(env: Env, seed: int = 0, tolerance: float = TOLERANCE) -> None:
     if not callable(getattr(env, "with_goal", None)):
         _check_without_goal(states.obs, valid, tolerance)
     _check_rewards(env, spec, played, valid, tolerance)
-    contract.check_steps(env)
+    described = attempt("describe", contract.robot_interface, env)
+    attempt("describe, whose entries must be JSON,", functools.partial(json.dumps, allow_nan=False), described)
+    attempt("check", contract.check_steps, env)
 
 
 @functools.partial(jax.jit, static_argnums=1)

@@ -1,8 +1,12 @@
-"""An observation that has the desired goal is named: relabelling would leave it as it is."""
+"""What `check` finds beyond shapes: observations that have the desired goal, which relabelling would leave as it is, and a
+description for policy files that JSON cannot hold.
+"""
 
+import math
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from conftest import refuses
 from flax import struct
@@ -78,3 +82,12 @@ class KeepsGoal(NoGoal):
 def test_a_goal_that_the_state_keeps_and_the_observation_has_is_named(part, named):
     with refuses(f"observation[2:4] must not be {named},", error=ComponentError):
         check_env(KeepsGoal(part))
+
+
+@pytest.mark.parametrize(
+    ("described", "named"),
+    [({"offset": np.zeros(3)}, "ndarray"), ({"gain": math.nan}, "JSON"), (property(lambda self: 1 / 0), "zero")],
+)
+def test_a_description_that_json_cannot_hold_is_named_before_training(described, named):
+    with refuses("describe", named, error=ComponentError):
+        check_env(type("Described", (PointMass,), {"robot_interface": described})())
