@@ -112,7 +112,8 @@ def _check_arrays(arrays: Mapping[str, Any], names: Mapping[str, Any], env: Env,
             continue
         if value is None or value.shape != shape or not np.can_cast(value.dtype, leaf.dtype, "same_kind"):
             given = "none" if value is None else f"{value.dtype}{list(value.shape)}"
-            problems.append(f"{name} must be {leaf.dtype}{list(shape)}; got {given}")
+            why = "" if name == "action" else f", as action has shape {list(action.shape)}"
+            problems.append(f"{name} must be {leaf.dtype}{list(shape)}{why}; got {given}")
     if problems:
         raise ValueError("\n".join(problems))
 

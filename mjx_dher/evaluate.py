@@ -84,10 +84,7 @@ def summarize(success: Any, reset_success: Any, ret: Any, valid: Any = None) -> 
 
 def summary(outcome: Outcome) -> dict[str, Array]:
     """Success rates [], traced. An invalid episode counts as a failure."""
-    return {
-        "success_rate": jnp.mean(outcome.success),
-        "reset_success_rate": jnp.mean(outcome.reset_success),
-    }
+    return {"success_rate": jnp.mean(outcome.success), "reset_success_rate": jnp.mean(outcome.reset_success)}
 
 
 def returns(outcome: Outcome) -> Array:

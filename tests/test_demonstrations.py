@@ -93,6 +93,7 @@ BAD_ARRAYS = [
     ({"length": np.full(6, 9.0)}, ("length", "int32", "float64")),
     ({"terminal": np.ones(6, bool)}, ("terminal", "False", "True")),
     ({"rewards": np.ones(6)}, ("rewards", "observation, achieved_goal")),
+    ({"action": np.zeros((6, 9, 2))}, ("observation must be", "[6, 10, ", "as action has shape [6, 9, 2]; got")),
 ]
 
 

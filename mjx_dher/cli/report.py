@@ -14,7 +14,7 @@ from mjx_dher.cli import settings
 from mjx_dher.cli.common import Trust, print_table
 from mjx_dher.runs.folder import fingerprint
 from mjx_dher.sweeps import grid
-from mjx_dher.system import files
+from mjx_dher.system import files, outputs
 from mjx_dher.tools import curves, figures
 from mjx_dher.validation import check_number
 
@@ -128,7 +128,7 @@ def report_command(argv: list[str], console: Console) -> int:
     figures.check(("svg",), "report")
     sweep = grid.is_sweep((args.folder,))
     if args.out is not None:
-        files.check_file(args.out, (".html",), args.overwrite)
+        outputs.check_file(args.out, (".html",), args.overwrite)
     from mjx_dher.sweeps import comparison, report, tables
 
     if sweep:

@@ -17,7 +17,7 @@ from mjx_dher.fleet import chunks, worker
 from mjx_dher.fleet.chunks import LOCAL, Chunk
 from mjx_dher.fleet.worker import News, Tell
 from mjx_dher.sweeps import grid
-from mjx_dher.system import files, signals, subprocesses
+from mjx_dher.system import signals, subprocesses
 from mjx_dher.system.files import BusyError
 from mjx_dher.validation import host_and_port
 
@@ -78,7 +78,7 @@ def joined(address: str, code: Path | None) -> Iterator["Cluster"]:
         if address == LOCAL:
             parent = os.environ.get("RAY_TMPDIR", tempfile.gettempdir())
             parent = parent if len(parent) < LONG_PATH else "/tmp"
-            private = stack.enter_context(files.temporary_folder("ray-", parent))
+            private = stack.enter_context(subprocesses.temporary_folder("ray-", parent))
             stack.enter_context(signals.cleaning(lambda: subprocesses.kill_sessions(started)))
             place = f"{private}/ray"  # inside a private folder, because Ray opens its folder to all users
             options |= {"include_dashboard": False, "object_store_memory": STORE_BYTES, "_temp_dir": place}

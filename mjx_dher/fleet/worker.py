@@ -24,7 +24,7 @@ from mjx_dher.runs.folder import results, run_folder
 from mjx_dher.runs.loop import Progress
 from mjx_dher.spec import RunSpec
 from mjx_dher.sweeps import grid
-from mjx_dher.system import files
+from mjx_dher.system import files, subprocesses
 from mjx_dher.system.files import FolderError
 from mjx_dher.types import Env
 
@@ -58,7 +58,7 @@ def train(chunk: Chunk, make_env: Callable[[RunSpec], Env], tell: Tell) -> list[
         raise ValueError(f"ray: node {socket.gethostname()} must have the driver's code: {'; '.join(wrong)}")
     reporter = _Reporter(chunk.id, tell)
     with contextlib.ExitStack() as stack:
-        place = chunk.storage or stack.enter_context(files.temporary_folder("mjx-dher-fleet-"))
+        place = chunk.storage or stack.enter_context(subprocesses.temporary_folder("mjx-dher-fleet-"))
         if chunk.storage is not None and not (place / chunks.NAMES_FILE).exists():
             raise ValueError(f"storage must be one folder for all nodes; node {socket.gethostname()} does not see {place}")
         if todo := [spec for spec in chunk.specs if not grid.is_done(place, spec)]:

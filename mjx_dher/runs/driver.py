@@ -208,8 +208,7 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
     """Trains parallel runs from their start or checkpoint, to their end or until a stop is requested."""
     options = session.options
     keep = options.keep if program.lanes == 1 else 1
-    physics = run_folder.engine_name(session.env)
-    flags = fingerprint.jax_flags()
+    physics, flags = run_folder.engine_name(session.env), fingerprint.jax_flags()
     runs = [fingerprint.identity(spec, physics, fingerprint.sources(spec), flags) for spec in specs]
     checkpoints = LaneCheckpoints(folders, program.lanes, session.shared, keep, session.sweep, session.report, runs)
     keys, hparams = program_lib.stack(specs, program.choices, program.lanes)
@@ -223,7 +222,8 @@ def _train(session: _Session, program: Program, specs: Sequence[RunSpec], folder
         own = [*zip(ended, specs, folders, runs)] if processes.leads() else []
         with run_folder.kept_unless_opened(folders if own else ()):
             logs = [_open(stack, session, program.lanes, *run) for run in own]
-        watch = _Watch(specs, folders, session.report, checkpoints.failed, [run_folder.config_bytes(row[2]) for row in own])
+        configs = [(folder / run_folder.CONFIG_FILE).read_bytes() for folder in folders[: len(own)]]
+        watch = _Watch(specs, folders, session.report, checkpoints.failed, configs)
         success = processes.broadcast(lambda: run_folder.success_rates(folders[0], start.epoch))  # for stop_at, of a single run
         schedule = Schedule(options.checkpoint_every)
         trained |= options.is_reached(success)

@@ -6,7 +6,6 @@ import itertools
 import json
 import os
 import shutil
-import tempfile
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -34,21 +33,6 @@ class FolderError(ValueError):
 
 class BusyError(FolderError):
     """Another process is using a folder."""
-
-
-def check_file(out: Path, endings: Iterable[str], overwrite: bool) -> None:
-    """Checks early that the file `out` can be written. Raises FolderError if `out` ends in none of `endings`, is a folder,
-    exists (without `overwrite`), or its folder does not exist.
-    """
-    endings = tuple(endings)
-    if out.suffix.lower() not in endings:
-        raise FolderError(f"out must end in {', '.join(endings)}; got {str(out)!r}")
-    if out.is_dir():
-        raise FolderError(f"out: {out} is a folder")
-    if out.exists() and not overwrite:
-        raise FolderError(f"out: {out} exists; pass another file or --overwrite")
-    if not out.parent.is_dir():
-        raise FolderError(f"out: there is no folder {out.parent}")
 
 
 def inside(folder: Path, paths: Iterable[Path]) -> list[Path]:
@@ -199,14 +183,6 @@ def _remove_empty(folders: Iterable[Path]) -> None:
     for folder in folders:
         with contextlib.suppress(OSError):  # something is in it
             folder.rmdir()
-
-
-@contextlib.contextmanager
-def temporary_folder(prefix: str, parent: str | None = None) -> Iterator[Path]:
-    """Makes a private folder, which is removed at the end of the block."""
-    folder = tempfile.TemporaryDirectory(prefix=prefix, dir=parent, ignore_cleanup_errors=True)
-    with signals.cleaning(folder.cleanup):
-        yield Path(folder.name)
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""Subprocesses: their output, and the reason for a failure in one line."""
+"""Subprocesses: their output, their folders, and the reason for a failure in one line."""
 
 import contextlib
 import json
@@ -24,6 +24,14 @@ class Answer(NamedTuple):
 
     def last_json(self) -> Any:
         return json.loads(self.out.splitlines()[-1])
+
+
+@contextlib.contextmanager
+def temporary_folder(prefix: str, parent: str | None = None) -> Iterator[Path]:
+    """Makes a private folder, which is removed at the end of the block."""
+    folder = tempfile.TemporaryDirectory(prefix=prefix, dir=parent, ignore_cleanup_errors=True)
+    with signals.cleaning(folder.cleanup):
+        yield Path(folder.name)
 
 
 @contextlib.contextmanager

@@ -13,7 +13,7 @@ import numpy as np
 from mjx_dher import __version__, lookup
 from mjx_dher.policy import Policy, from_arrays
 from mjx_dher.spec import RunSpec
-from mjx_dher.system import files
+from mjx_dher.system import files, outputs
 
 FORMAT_VERSION = 1  # version of names, shapes and meanings in both files
 OPSET = 17  # ONNX opset; later ones add nothing to this graph, and fewer programs support them
@@ -32,7 +32,7 @@ class Contents(NamedTuple):
 def check(file_format: str, out: Path, overwrite: bool) -> None:
     """Raises ValueError early if `file_format` is unknown, its package is missing, or `out` cannot or must not be written."""
     lookup.check_name("format", file_format, FORMATS)
-    files.check_file(out, [f".{file_format}"], overwrite)
+    outputs.check_file(out, [f".{file_format}"], overwrite)
     lookup.require_extra(f"format {file_format}", file_format, "export")
 
 

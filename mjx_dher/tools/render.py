@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mjx_dher import lookup
-from mjx_dher.system import files, private_api, signals, subprocesses
+from mjx_dher.system import files, outputs, private_api, signals, subprocesses
 from mjx_dher.validation import check_all
 
 MOST_FPS = 50  # largest frame rate of a file, the limit of GIF
@@ -42,7 +42,7 @@ FORMATS = {
 def check_output(out: Path, width: int, height: int, overwrite: bool) -> None:
     """Raises ValueError early for invalid arguments."""
     sizes = [(_check_size, "width", width), (_check_size, "height", height)]
-    check_all((files.check_file, out, FORMATS, overwrite), *sizes)
+    check_all((outputs.check_file, out, FORMATS, overwrite), *sizes)
 
 
 def _check_size(field: str, value: int) -> None:

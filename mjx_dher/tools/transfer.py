@@ -21,7 +21,7 @@ import numpy as np
 
 from mjx_dher.policy.load import load_policy
 from mjx_dher.runs.folder.reading import read_spec
-from mjx_dher.system import files, subprocesses
+from mjx_dher.system import subprocesses
 from mjx_dher.system.machine import user_cache
 
 ORIGINALS = {
@@ -83,7 +83,7 @@ def play_apart(run: Path, python: Path, episodes: int, seed: int, workers: int) 
     """
     workers = min(workers, episodes)
     bounds = [episodes * i // workers for i in range(workers + 1)]
-    with files.temporary_folder("mjx-dher-transfer-") as folder, contextlib.ExitStack() as stack:
+    with subprocesses.temporary_folder("mjx-dher-transfer-") as folder, contextlib.ExitStack() as stack:
         # A folder with only this package, because the other Python has its own NumPy and MuJoCo.
         (folder / "mjx_dher").symlink_to(subprocesses.PACKAGE, target_is_directory=True)
         processes = []

@@ -25,7 +25,7 @@ POLICY_RATIO = 20.0  # largest ratio of a policy's arrays to its uncompressed fi
 Form = Any
 _DIGEST = "[0-9a-f]{10}"
 _COUNT, _LANES = (int, "[0, 9000000000000000000]"), (int, "[1, 1000000]")
-_SHARE, _AMOUNT = (float, "[0, 1]"), (float, "[0, inf]")
+_SHARE, _AMOUNT, _FINITE = (float, "[0, 1]"), (float, "[0, inf]"), (float, "(-inf, inf)")
 
 _IDENTITY: Form = {"sources": {"*": str}}  # `fingerprint.identity`
 _CONFIG: Form = {
@@ -52,13 +52,7 @@ RESULT: Form = {
     "wall_seconds": _AMOUNT,
 }
 _RATES: Form = dict.fromkeys(("success_rate", "success_low", "success_high", "reset_success_rate"), _SHARE)
-RESULT_FINISHED: Form = {
-    **RESULT,
-    **_RATES,
-    "episodes": _COUNT,
-    "discarded_episodes?": _COUNT,
-    "return_mean?": (float, "(-inf, inf)"),
-}
+RESULT_FINISHED: Form = {**RESULT, **_RATES, "episodes": _COUNT, "discarded_episodes?": _COUNT, "return_mean?": _FINITE}
 ROW: Form = {  # of metrics.csv; other metrics of learners can be any number
     **dict.fromkeys(("epoch", "env_steps", "updates"), _COUNT),
     "wall_seconds": _AMOUNT,

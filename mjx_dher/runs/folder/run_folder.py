@@ -155,15 +155,10 @@ def success_rates(path: Path, ended: int) -> list[float]:
     return [row["success_rate"] for row in results.read_metrics(path)]
 
 
-def config_bytes(path: Path) -> bytes:
-    """Content of config.json."""
-    return (path / CONFIG_FILE).read_bytes()
-
-
 def check_in_place(path: Path, config: bytes) -> None:
     """Raises FolderError if `path` has no metrics.csv, or not the `config` of the run that trains in it."""
     try:
-        same = config_bytes(path) == config
+        same = (path / CONFIG_FILE).read_bytes() == config
         changed = None if same and (path / METRICS_FILE).exists() else "lost a file or got another config.json"
     except (FileNotFoundError, NotADirectoryError):
         changed = "was moved or deleted"
