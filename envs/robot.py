@@ -46,7 +46,7 @@ class RobotLoop:
         if unknown := {"advance", "step", "observed", "observe_goal"} & set(task._own):
             raise ValueError(f"a loop does not know what {type(task).__name__}.{min(unknown)} does; {_BY_HAND}")
         self.task, self.policy = task, policy
-        trained, own = getattr(policy, "interface", None) or {}, json.loads(json.dumps(robot_interface(task)))
+        trained, own = getattr(policy, "interface", None) or {}, json.loads(json.dumps(robot_interface(env)))
         if "own" in trained and trained["own"] != own.get("own", []):  # policies of older versions lack it
             raise ValueError(f"env has its own {own.get('own', [])}, and the policy was trained with own {trained['own']}")
         described = trained.keys() & own.keys()  # env leaves out what its own methods may contradict

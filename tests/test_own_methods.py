@@ -115,6 +115,22 @@ def test_a_loop_refuses_what_it_would_not_do(name, lost):
         RobotLoop(wrappers.ActionDelay(env, 1), lambda obs: np.zeros(2))
 
 
+class Softer(wrappers.ActionFilter):
+    pass
+
+
+def test_a_loop_takes_the_policy_of_an_own_filter():
+    def policy(obs):
+        return np.zeros(2)
+
+    env = Softer(made(Reach), 0.5)
+    policy.interface = robot_interface(env)
+    assert policy.interface == {"dt": 0.04, "own": ["Softer"]}
+    RobotLoop(env, policy)
+    with refuses("own", "Softer"):
+        RobotLoop(made(Reach), policy)
+
+
 def test_a_loop_applies_shipped_wrappers_and_leaves_out_noise_and_delay():
     wrapped = wrappers.ActionFilter(wrappers.ActionDelay(wrappers.ObservationNoise(made(Reach), 0.5), 2), 0.0)
     assert robot_interface(wrapped) == robot_interface(made(Reach))
