@@ -25,14 +25,14 @@ def compile_once():
     """Tests and fixtures of a module that imports it share compiled programs, which have no state."""
     compile_runs = program.compile_runs
 
-    def cached(env, specs, max_lanes, final_episodes, report, devices=()):
+    def cached(env, specs, max_lanes, final_episodes, report, devices=(), sweep=False):
         choices = str(program.choices_of(specs))
         lanes = min(len(specs), max_lanes or len(specs))
         lanes = math.ceil(len(specs) / math.ceil(len(specs) / lanes))
-        key = (type(env), specs[0].program, choices, lanes, final_episodes, machine.available_bytes, devices)
+        key = (type(env), specs[0].program, choices, lanes, final_episodes, machine.available_bytes, devices, sweep)
         if key not in _compiled:
             lines = []
-            _compiled[key] = (compile_runs(env, specs, max_lanes, final_episodes, lines.append, devices), lines)
+            _compiled[key] = (compile_runs(env, specs, max_lanes, final_episodes, lines.append, devices, sweep), lines)
         compiled, lines = _compiled[key]
         for line in lines:
             report(line)

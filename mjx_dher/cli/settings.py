@@ -93,14 +93,14 @@ def amount(config: Config, episode_length: int, runs: int = 1) -> str:
     )
 
 
-def memory_lines(env: Any, specs: Sequence[RunSpec], lanes: int | None, devices: int | str) -> list[str]:
+def memory_lines(env: Any, specs: Sequence[RunSpec], lanes: int | None, devices: int | str, sweep: bool = False) -> list[str]:
     """Lines about the memory of runs of one program, without compiling it. Raises ValueError if they cannot be trained."""
     import jax
 
     from mjx_dher.runs import program
     from mjx_dher.system import machine
 
-    train = program.check_runs(env, specs, lanes, devices)
+    train = program.check_runs(env, specs, lanes, devices, sweep)
     leaves = jax.tree.leaves(jax.eval_shape(train.learner.init, jax.random.key(0)))
     learner = sum(leaf.size * leaf.dtype.itemsize for leaf in leaves)
     available = machine.available_bytes()

@@ -91,7 +91,7 @@ class SweepArgs:
     distributed: bool = False
     """Train together with the other processes of this job, which run the same command (docs/scaling.md)."""
     devices: Devices = 1
-    """Number of devices, or all. Parallel runs are distributed. With more devices than runs, several share a run."""
+    """Number of devices, or all. Parallel runs are distributed. With fewer `--lanes` than devices, several share a run."""
     fleet: Annotated[FleetOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=FleetOptions)
     threshold: float = 0.9
     """Success rate for the time to success."""
@@ -274,7 +274,7 @@ def _dry_run(args: SweepArgs, trials: list[RunSpec], console: Console) -> int:
     for group in groups:
         program = group[0].program
         env = make_env(program)
-        memory = settings.memory_lines(env, group, args.lanes, 1 if args.distributed else args.devices)
+        memory = settings.memory_lines(env, group, args.lanes, 1 if args.distributed else args.devices, sweep=True)
         samplers = ", ".join(dict.fromkeys(run.sampler for run in group))
         console.print(f"{program.env}, learner {program.learner}: {len(group)} runs; samplers {samplers}", soft_wrap=True)
         for line in (settings.amount(program.config, env.episode_length, len(group)), *memory):

@@ -117,7 +117,7 @@ def train_runs(
       folders: run folders, one per run. Missing ones are made.
       lanes: most parallel runs. Default: one on a CPU, whose cores one run fills, otherwise as many as fit into memory.
       devices: number of devices, or "all". Parallel runs are distributed among them. If there are fewer runs than devices,
-        several devices share a run.
+        several devices share a run; in a sweep, if there are fewer `lanes`.
       shared: folder for the checkpoints of parallel runs. Default: "unfinished" next to the first run's folder.
       sweep: whether to skip runs that have ended or that another process trains, and to restart runs whose checkpoints are
         unusable, instead of raising an error.
@@ -149,7 +149,7 @@ def train_runs(
         _is_trained(env, *waiting[0], saved)
     with contextlib.nullcontext() if processes.is_alone() else signals.held(report, shared.parent):  # others would wait
         own, most = [spec for spec, _ in waiting], mesh.most_lanes(lanes, placed_on)
-        program = program_lib.compile_runs(env, own, most, options.final_episodes, report, placed_on)
+        program = program_lib.compile_runs(env, own, most, options.final_episodes, report, placed_on, sweep)
         processes.check_equal({"lanes": program.lanes})  # by default they depend on memory
         return _train_in_turn(session, program, claims, waiting)
 

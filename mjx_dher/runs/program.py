@@ -98,18 +98,22 @@ def make_loop(env: Env, spec: RunSpec, choices: Choices, layout: Layout = ONE) -
     return train._replace(init=lambda key, hparams: train.add(train.init(key, hparams), episodes))
 
 
-def check_runs(env: Env, specs: Sequence[RunSpec], lanes: int | None = None, devices: int | str = 1) -> Train:
+def check_runs(
+    env: Env, specs: Sequence[RunSpec], lanes: int | None = None, devices: int | str = 1, sweep: bool = False
+) -> Train:
     """Training loop of runs that share a program. Raises ValueError, before compilation, if they cannot be trained."""
     for spec in specs:
         spec_lib.validate(spec, env.episode_length)
     placed_on = mesh.find(devices)
-    return _plan(env, specs, mesh.most_lanes(lanes, placed_on), placed_on)[0]
+    return _plan(env, specs, mesh.most_lanes(lanes, placed_on), placed_on, sweep)[0]
 
 
-def _plan(env: Env, specs: Sequence[RunSpec], max_lanes: int | None, devices: Sequence[Any]) -> tuple[Train, Layout, int]:
+def _plan(
+    env: Env, specs: Sequence[RunSpec], max_lanes: int | None, devices: Sequence[Any], sweep: bool
+) -> tuple[Train, Layout, int]:
     """Training loop of runs, its layout, and the most lanes per device. Raises ValueError like `compile_runs`."""
     most = min(len(specs), max_lanes or len(specs))
-    layout = mesh.arrange(devices, most)
+    layout = mesh.arrange(devices, (max_lanes or len(devices)) if sweep else most)
     train = make_loop(env, specs[0], choices_of(specs), layout)
     loop.check_memory(train, specs[0].config, layout.sharers)
     return train, layout, math.ceil(most / layout.lanes)
@@ -122,14 +126,16 @@ def compile_runs(
     final_episodes: int,
     report: Callable[[str], None],
     devices: Sequence[Any] = (),
+    sweep: bool = False,
 ) -> Program:
     """Compiles for as many lanes as allowed and as fit into memory, by the compiler's estimate.
 
+    In a `sweep`, whether devices share a run depends on `max_lanes` alone, because fewer runs are left at its next start.
     The final evaluation may still be compiling in a thread while the runs are trained. Raises ValueError for too little memory
     for one run, or sizes that the devices do not divide.
     """
     spec, choices = specs[0], choices_of(specs)
-    train, layout, lanes = _plan(env, specs, max_lanes, devices)  # lanes per device, like the bytes
+    train, layout, lanes = _plan(env, specs, max_lanes, devices, sweep)  # lanes per device, like the bytes
     available = machine.available_bytes()
     if available is not None:  # the rings must fit before anything is compiled
         available //= layout.sharers

@@ -110,7 +110,7 @@ def train(
     trained: list[Result] = []
     groups = [(make_env(own[0]), own) for own in by_program(specs)]
     for env, own in groups[1:]:  # before the first ones train, which may take days
-        program.check_runs(env, own, options.get("lanes"), options.get("devices", 1))
+        program.check_runs(env, own, options.get("lanes"), options.get("devices", 1), sweep=True)
     for env, own in groups:
         if trained and processes.any_process(should_stop()):
             break
