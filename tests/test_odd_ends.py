@@ -20,6 +20,7 @@ from test_comparison import cell
 import mjx_dher
 from mjx_dher import HParams, Options, RunSpec, cli, gym, import_paths, relabel, replay, samplers, trainer
 from mjx_dher.cli import sweep
+from mjx_dher.cli.report import compare
 from mjx_dher.cli.sweep import parse_sweep_args
 from mjx_dher.cli.train import parse_train_args
 from mjx_dher.context import Context, return_bounds
@@ -136,7 +137,7 @@ def test_an_engine_that_was_named_or_chosen_is_the_same_run():
     assert given == meant
 
 
-def test_settings_of_other_flags_or_lengths_are_not_compared():
+def test_settings_of_other_flags_devices_or_lengths_are_not_compared(tmp_path, capsys):
     settings = (("future", {"source": ""}), ("weighted", {"source": "JAX_RANDOM_SEED_OFFSET 1000"}))
     cells = [cell(sampler, i, [0.1, 0.5, i / 9], **own) for i in (0, 1) for sampler, own in settings]
     rows = comparison.compare(comparison.groups(cells)["push"], "future", 0.9)
@@ -144,6 +145,15 @@ def test_settings_of_other_flags_or_lengths_are_not_compared():
     longer = [cell("weighted", i, [0.1, 0.5, i / 9, 0.9, 0.9, 0.9], source="") for i in (0, 1)]
     rows = comparison.compare(comparison.groups([*cells[::2], *longer])["push"], "future", 0.9)
     assert [math.isnan(value) for value in (rows[1].better, rows[1].area_gain, rows[1].p_value)] == [True] * 3
+    arms = [(sampler, on) for sampler in ("future", "weighted") for on in ("", "2 devices")]
+    placed = [cell(sampler, i, [0.1, 0.5, i / 9], source=on) for sampler, on in arms for i in (0, 1)]
+    by_env = comparison.groups(placed)
+    bases = [comparison._baseline_of(group, by_env["push"], "future") for group in by_env["push"]]
+    assert [base and base.label for base in bases] == [None, None, "future", "future, 2 devices"]
+    by_env["push"].pop(0)
+    compare(tmp_path, by_env, "future", 0.9, cli.PlainConsole(width=500))
+    told = "push: no baseline 'future' of the same length and other settings for: weighted\n"
+    assert told in capsys.readouterr().out
     as_long = [cell("weighted", i, [0.1, 0.5, i / 9, 0.9], source="") for i in (0, 1)]
     rows = comparison.compare(comparison.groups([*cells[::2], *as_long])["push"], "future", 0.9)
     assert not math.isnan(rows[1].area_gain)  # one epoch more: totals are rounded up

@@ -34,9 +34,10 @@ def compare(
     comparison.write(folder, rows)
     print_table(*comparison.table(rows), console)
     for env, groups in by_env.items():
-        if len(groups) > 1 and all(math.isnan(row.better) for row in rows if row.env == env):
-            labels = "; ".join(group.label for group in groups)
-            console.print(f"{env}: no baseline {baseline!r} to compare with among: {labels}")
+        own = [row.better for row in rows if row.env == env]
+        alone = [g.label for g, better in zip(groups, own) if math.isnan(better) and baseline not in (g.sampler, g.label)]
+        if len(groups) > 1 and alone:
+            console.print(f"{env}: no baseline {baseline!r} of the same length and other settings for: {'; '.join(alone)}")
     return rows
 
 

@@ -181,10 +181,10 @@ def _baseline_of(group: Group, settings: list[Group], baseline: str) -> Group | 
     """Setting to compare `group` with, or None if there is none or `group` is the baseline."""
 
     def fits(other: Group) -> bool:
-        # The baseline may lack the files of this setting's own components, and no JAX flags.
+        # The baseline may lack the files of this setting's own components, but no JAX flags or devices.
         base, own = (set(filter(None, str(each.others.get("source", "")).split(", "))) for each in (other, group))
         rest = ((name, value) for name, value in other.others.items() if name != "source")
-        same = base <= own and not any(text.startswith("JAX_") for text in own - base)
+        same = base <= own and not any(text.startswith("JAX_") or text.endswith(" devices") for text in own - base)
         return same and all(group.others.get(name, value) == value for name, value in rest)
 
     of_sampler = [other for other in settings if other.sampler == baseline]
