@@ -95,7 +95,7 @@ def weights(priority: PriorityFn | Priority, episodes: Episode, context: Context
     return replay.as_priority(weight)
 
 
-def renew(priority: Priority, ring: ReplayState, context: Context, rows: Array | None = None) -> ReplayState:
+def renew(priority: Priority | PriorityFn, ring: ReplayState, context: Context, rows: Array | None = None) -> ReplayState:
     """Renews the ring's weights with `priority.renew`, if it exists.
 
     Args:
@@ -104,10 +104,10 @@ def renew(priority: Priority, ring: ReplayState, context: Context, rows: Array |
     Raises:
       ValueError: `renew` does not return real numbers [E], or [R].
     """
-    if priority.renew is None:
+    if (renew := whole(priority).renew) is None:
         return ring
     part = ring if rows is None else replay.take(ring, rows)
-    weight = check.array("priority: weights [E] of renew", priority.renew(part, context), part.priority.shape, jnp.number)
+    weight = check.array("priority: weights [E] of renew", renew(part, context), part.priority.shape, jnp.number)
     filled = (jnp.arange(ring.priority.shape[0]) if rows is None else rows) < ring.size
     weight = jnp.where(filled, replay.as_priority(weight), 0.0)
     return dataclasses.replace(ring, priority=weight if rows is None else ring.priority.at[rows].set(weight))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from mjx_dher import check, priorities, replay, samplers
 from mjx_dher.config import HParams
 from mjx_dher.context import Context
-from mjx_dher.priorities import Priority
+from mjx_dher.priorities import Priority, PriorityFn
 from mjx_dher.replay import Cumulative, Pool, ReplayState, Sample
 from mjx_dher.samplers import LogWeightsFn, Sampler
 from mjx_dher.types import Array, Batch, PRNGKey
@@ -71,9 +71,9 @@ def _keys(key: PRNGKey) -> tuple[PRNGKey, PRNGKey, PRNGKey]:
     return coin_key, pool_key, draw_key
 
 
-def add_pool(ring: ReplayState, sample: Sample, sampler: Sampler, key: PRNGKey) -> Sample:
+def add_pool(ring: ReplayState, sample: Sample, sampler: Sampler | LogWeightsFn | str, key: PRNGKey) -> Sample:
     """Adds goals of other episodes to a sample, if the sampler uses them. Pass the same `key` to `relabel`."""
-    if not sampler.cross_episode:
+    if not samplers.make(sampler).cross_episode:
         return sample
     return dataclasses.replace(sample, pool=replay.sample_pool(ring, _keys(key)[1], sample.step.shape[0]))
 
@@ -136,7 +136,7 @@ def draw_batches(
     context: Context,
     weights: Cumulative,
     n_step: int = 1,
-    priority: Priority | None = None,
+    priority: Priority | PriorityFn | str | None = None,
 ) -> Batch:
     """Draws and relabels transitions for the learner.
 
@@ -151,6 +151,7 @@ def draw_batches(
     """
     check_count("n_step", n_step)
     number, sampler = math.prod(shape), samplers.make(sampler)
+    priority = None if priority is None else priorities.whole(priorities.make(priority))
 
     def draw(count: int) -> tuple[Sample, Batch]:
         row_key, sample_key, relabel_key = jax.random.split(key, 3)

@@ -126,6 +126,7 @@ def _step(env: Env, spec: EnvSpec, policy: PolicyFn, playing: _Playing, inputs: 
     action = policy(inputs, state.obs)
     if np.shape(action) != (num_envs, env.action_size):
         raise ValueError(f"policy must return actions [N, A] = {[num_envs, env.action_size]}; got {list(np.shape(action))}")
+    action = jnp.asarray(action, jnp.float32)  # an own learner's may have 64 bits
     following = jax.vmap(env.step)(state, action)
     check.kept("step", state, following, leading=1)
     reward = following.reward

@@ -120,6 +120,11 @@ def test_runs_are_called_by_what_differs(tmp_path):
     assert curves.labels(same[:2]) == [str(tmp_path / "d"), str(tmp_path / "e")]
     unfinished = curves.read_curve(write_run(tmp_path / "g", dataclasses.replace(SPEC, seed=7), status=None))
     assert curves.labels([same[0], unfinished]) == ["seed 0", "seed 7 (not ended)"]
+    others = [
+        make("h", learner="ddpg", seed=2),
+        make("i", learner="td3", seed=2, config=dataclasses.replace(SPEC.config, policy_delay=2)),
+    ]
+    assert curves.labels(others) == ["ddpg", "td3, policy_delay 2"]
     head, cells = curves.curves_table([same[0], unfinished])
     assert dict(zip(head, cells[0]))["final success (95 % interval)"] == "0.970 (0.951 to 0.982)"
     assert dict(zip(head, cells[1]))["last evaluation"] == "1.00"

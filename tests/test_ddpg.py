@@ -75,6 +75,16 @@ def test_update_is_one_adam_step_of_both_from_the_old_parameters(state):
     np.testing.assert_allclose(losses["q_mean"], -0.875, rtol=1e-6)
 
 
+def test_a_subclass_s_gradients_are_used(state):
+    class Own(DDPG):
+        def gradients(self, *args):
+            gradients, metrics = ddpg.compute_gradients(*args)
+            return gradients, metrics | {"own_metric": jnp.float32(3)}
+
+    _, metrics = Own(spec_of(1, 1, 1), NETWORKS, NETWORKS).update(state, BATCH, HP)
+    assert metrics["own_metric"] == 3
+
+
 def test_gradients_are_those_of_each_loss_by_its_own_network(state):
     """By differences: a step along one network's parameters changes the loss by its gradient, and the other does not count."""
     gradients, _ = ddpg.compute_gradients(NETWORKS, state.params, state.target, BATCH, BOUNDS, HP)
@@ -90,7 +100,7 @@ def test_summed_gradients_are_averaged_ones_with_a_smaller_adam_eps(state, monke
     of_sum, of_mean, of_default, one = state, state, state, ddpg.compute_gradients
     for _ in range(5):
         with monkeypatch.context() as patch:
-            patch.setattr(ddpg, "compute_gradients", lambda *args: _times(8.0, *one(*args)))
+            patch.setattr(DDPG, "gradients", staticmethod(lambda *args: _times(8.0, *one(*args))))
             of_sum, _ = LEARNER.update(of_sum, BATCH, HP._replace(adam_eps=1e-3))
         of_mean, _ = LEARNER.update(of_mean, BATCH, HP._replace(adam_eps=1e-3 / 8))
         of_default, _ = LEARNER.update(of_default, BATCH, HP._replace(adam_eps=1e-3))

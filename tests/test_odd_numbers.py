@@ -17,13 +17,15 @@ from flax import struct
 from rich.console import Console
 
 import mjx_dher.gym
-from mjx_dher import RunSpec, make_train, relabel, replay, samplers, trainer
+from mjx_dher import RunSpec, learners, make_train, relabel, replay, samplers, trainer
 from mjx_dher.cli.common import print_summary
 from mjx_dher.config import HParams
 from mjx_dher.context import Context
+from mjx_dher.contract import env_spec
 from mjx_dher.contrib import generators
 from mjx_dher.demonstrations import read_demonstrations, write_demonstrations
 from mjx_dher.evaluate import play_policy, summarize
+from mjx_dher.learners import ddpg
 from mjx_dher.policy import learner_policy
 from mjx_dher.priorities import make, whole
 from mjx_dher.rollout import rollout, where_each
@@ -115,6 +117,20 @@ def test_a_run_is_nearly_the_same_with_64_bits(learner, generator):
     for (name, own), (_, other) in both_ways(train):
         assert own.dtype == other.dtype, name
         np.testing.assert_allclose(own, other, rtol=1e-3, atol=1e-4, err_msg=str(name))
+
+
+class Own(ddpg.DDPG):
+    def explore(self, *args):
+        return super().explore(*args).astype(float)  # as jnp.zeros without a dtype is
+
+
+def test_an_own_learner_s_actions_may_have_64_bits():
+    with jax.enable_x64(True):
+        own = lambda *args: Own(*vars(ddpg.make(*args)).values())  # noqa: E731
+        train = trainer.make_train(PointMass(), TINY, learner=learners.make(own, TINY, env_spec(PointMass())))
+        state, metrics = jax.jit(train.epoch)(jax.jit(train.init)(jax.random.key(0), HPARAMS))
+    assert state.replay.episodes.action.dtype == np.float32
+    assert np.isfinite(metrics["critic_loss"])
 
 
 # Random keys of another generator than JAX's default.

@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_dher import replay, samplers
+from mjx_dher import priorities, replay, samplers
 from mjx_dher.components import COMPONENTS
 from mjx_dher.config import HParams
 from mjx_dher.context import Context
+from mjx_dher.priorities import Priority
 from mjx_dher.relabel import add_pool, draw_batches, hindsight_goals, look_ahead, relabel
 from mjx_dher.rollout import rollout
 from mjx_dher.types import Batch, Episode
@@ -213,6 +214,24 @@ def test_returns_of_several_steps_by_hand(step, goal, reward, num_steps):
     np.testing.assert_allclose(batch.discount, [0.5**num_steps])
     np.testing.assert_array_equal(batch.next_observation, LINE.observation[step + num_steps][None])
     np.testing.assert_array_equal(batch.observation, one.observation)
+
+
+def test_samplers_and_priorities_are_given_by_name_as_functions_and_whole(ring):
+    key, weights = jax.random.key(4), replay.cumulative(ring)
+    sample = sample_of(ring, key, 50)
+    pools = [add_pool(ring, sample, given, key).pool for given in ("random", samplers.make("random"))]
+    jax.tree.map(np.testing.assert_array_equal, *pools)
+    for given in ("weighted", samplers.make("weighted").log_weights, samplers.make("weighted")):
+        assert add_pool(ring, sample, given, key) is sample
+    eventful = priorities.make("eventful")
+    assert not isinstance(eventful, Priority)
+    drawn = [
+        draw_batches(ring, key, (20,), "future", CONTEXT, weights, priority=given)
+        for given in ("eventful", eventful, priorities.whole(eventful), None)
+    ]
+    for other in drawn[1:]:
+        jax.tree.map(np.testing.assert_array_equal, drawn[0], other)
+    assert priorities.renew(eventful, ring, CONTEXT) is ring
 
 
 def test_one_step_ahead_is_the_transition(ring):

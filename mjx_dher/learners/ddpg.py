@@ -62,6 +62,8 @@ def compute_gradients(
 class DDPG(ActorCriticBase):
     """Learner with pure functions of a `DDPGState`. `learners.Learner` documents the methods."""
 
+    gradients = staticmethod(compute_gradients)  # a subclass can override it
+
     def init(self, key: PRNGKey) -> DDPGState:
         actor_key, critic_key = jax.random.split(key)
         observation, goal, action = zeros(self.spec, self.networks)
@@ -85,7 +87,7 @@ class DDPG(ActorCriticBase):
     def update(self, state: DDPGState, batch: Batch, hparams: HParams) -> tuple[DDPGState, Metrics]:
         """Takes one Adam step for critic and actor, both from the old parameters."""
         batch, bounds = self.normalize_batch(state, batch, hparams), self.return_bounds(hparams)
-        gradients, metrics = compute_gradients(self.learning, state.params, state.target, batch, bounds, hparams)
+        gradients, metrics = self.gradients(self.learning, state.params, state.target, batch, bounds, hparams)
         adam = common.adam(Params(actor=hparams.actor_lr, critic=hparams.critic_lr), hparams.adam_eps)
         updates, opt_state = adam.update(self.mean(gradients), state.opt_state)
         params = optax.apply_updates(state.params, updates)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mjx_dher.components import reads
 from mjx_dher.runs.folder import fingerprint, results, run_folder
 from mjx_dher.runs.folder.results import Record
 from mjx_dher.runs.folder.run_folder import FAILED
@@ -105,10 +106,10 @@ def _unit(curves: Sequence[Record]) -> tuple[float, str]:
 
 
 def labels(curves: Sequence[Record]) -> list[str]:
-    """Name of each run: the settings in which the runs differ, or else their folders."""
+    """Name of each run: the settings that it reads and in which the runs differ, or else its folder."""
     settings = [{**fingerprint.settings(c.spec), "seed": c.spec.seed, "physics": c.content["physics"]} for c in curves]
     varying = [name for name in fingerprint.varying(settings) if name != "engine"]
-    told = [", ".join(fingerprint.named(name, each[name]) for name in varying) for each in settings]
+    told = [", ".join(fingerprint.named(name, each[name]) for name in varying if reads(each, name)) for each in settings]
     apart = [text if text and told.count(text) == 1 else f"{text}: {c.folder}".lstrip(": ") for text, c in zip(told, curves)]
     return [f"{text} ({c.status})" if c.status != run_folder.FINISHED else text for text, c in zip(apart, curves)]
 
