@@ -69,7 +69,7 @@ def test_a_run_that_kept_nothing_says_how_to_train_a_longer_one(tmp_path, capsys
     assert cli.main(["resume", str(out), "--total-steps", "200"]) == 2
     error = capsys.readouterr().err
     assert "has ended; there is nothing to resume: --keep-end would have kept its last checkpoint" in error
-    assert f"`train.py --config {out} --total-steps N`" in error
+    assert f"`python train.py --config {out} --total-steps N`" in error
 
 
 @pytest.mark.slow
