@@ -75,8 +75,10 @@ def test_the_command_line_sweeps_and_goes_on_and_plots(tmp_path, point_mass, cap
     for command in ("plot", "report"):
         assert cli.main([command, str(tmp_path / "sweep"), "--baseline", "weigted"]) == 2
         assert "error: baseline must be one of future, " in capsys.readouterr().err
-        assert cli.main([command, str(tmp_path / "sweep"), "--baseline", "weighted, her_k 8"]) == 0
-    assert before != (tmp_path / "sweep" / "comparison.csv").read_bytes()
+    assert before == (tmp_path / "sweep" / "comparison.csv").read_bytes()
+    own = ["--baseline", "weighted, her_k 8", "--formats", "svg"]
+    assert cli.main(["plot", str(tmp_path / "sweep"), *own, "--out", str(tmp_path / "pictures")]) == 0
+    assert before != (tmp_path / "pictures" / "comparison.csv").read_bytes()
 
 
 def test_a_folder_that_cannot_be_written_to_is_reported_before_anything_compiles(tmp_path, point_mass, capsys, monkeypatch):
