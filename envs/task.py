@@ -16,6 +16,7 @@ from mjx_dher.envs import probes
 from mjx_dher.envs.base import State
 from mjx_dher.envs.controls import Actuators, Control, JointDelta, JointPosition, Mocap, Torque
 from mjx_dher.envs.engines import Controls, Physics
+from mjx_dher.envs.engines.features import check_inputs
 from mjx_dher.envs.goals import Goal, Joints, Mark, Pose, Position, Rotation
 from mjx_dher.envs.kinematics import Place
 from mjx_dher.envs.observations import Entry, Sensors
@@ -74,6 +75,7 @@ class MujocoTask(SimulatedTask):
 
     def bind(self) -> None:
         """Looks up the declared names in the model, and probes the model."""
+        check_inputs(self.model)
         if not callable(self.controls):
             raise ValueError(f"controls is a method of a task; the field is control; got controls = {self.controls!r}")
         _check_names(type(self))

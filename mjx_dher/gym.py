@@ -100,9 +100,8 @@ class _GoalApi:
         obs = _nested(dict(state.obs), np.array)
         failed = getattr(state, "failed", np.zeros(np.shape(state.success), bool))
         info = {"is_success": np.array(state.success, np.float64), "failed": np.array(failed)}
-        reward = np.array(state.reward, np.float64)
         self._state = state
-        return obs, reward, info
+        return obs, np.array(state.reward, np.float64), info
 
 
 class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):
@@ -347,4 +346,5 @@ def _check_reset(options: dict[str, Any] | None, seed: Any, count: int) -> list[
 _VECTOR: dict[str, Any] = {"vector_entry_point": "mjx_dher.gym:GymVectorEnv"}
 for _id, _name in IDS.items():
     gymnasium.register(_id, "mjx_dher.gym:GymEnv", max_episode_steps=HORIZON, kwargs={"name": _name}, **_VECTOR)
+make_custom.metadata = GymEnv.metadata  # type: ignore[attr-defined] # gymnasium.make wraps its pictures in windows and lists
 gymnasium.register(ENV_ID, "mjx_dher.gym:make_custom", **_VECTOR)

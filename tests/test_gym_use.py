@@ -78,6 +78,8 @@ def test_copies_play_on_alone(name, again):
 
 def test_an_environment_of_ones_own_needs_no_more_than_the_contract():
     """No `check`, `failed`, `engine` nor model; the episode ends after the environment's own number of steps."""
+    pictures = gymnasium.make(ENV, name="point_mass:PointMass", render_mode="rgb_array_list")
+    assert isinstance(pictures, gymnasium.wrappers.RenderCollection)
     env = gymnasium.make(ENV, name="point_mass:PointMass", render_mode="rgb_array")
     obs, info = env.reset(seed=0)
     ends = [env.step(np.ones(2))[2:4] for _ in range(10)]

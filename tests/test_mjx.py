@@ -175,6 +175,43 @@ def test_free_bodies_are_implicit_in_gyroscopic_forces_as_in_mujoco_c():
         np.testing.assert_allclose(data.qvel[dofs], moved, rtol=1e-6, atol=1e-5)
 
 
+RADIAN = '<mujoco><compiler angle="radian"/>'
+NARROW = '<body><joint name="n" range="-.1 .1" limited="true" margin="{}"/><geom size="1"/></body>'
+
+
+def test_what_only_mujoco_c_computes_is_rejected():
+    for option, body, named in (
+        ('integrator="discrete"', NARROW.format(0), "an integrator other than Euler, implicitfast and RK4"),
+        ("", NARROW.format(0.15), "limits nearer to each other than twice their margin ('n')"),
+    ):
+        model = mujoco.MjModel.from_xml_string(f"{RADIAN}<option {option}/><worldbody>{body}</worldbody></mujoco>")
+        with refuses("engine jax", named):
+            make_engine("jax", model, 1)
+    make_engine("jax", mujoco.MjModel.from_xml_string(f"{RADIAN}<worldbody>{NARROW.format(0.05)}</worldbody></mujoco>"), 1)
+
+
+def test_cg_has_the_model_s_iterations():
+    text = '<mujoco><option solver="{}" iterations="70" ls_iterations="30"/><worldbody/></mujoco>'
+    for solver, expected in (("Newton", (8, 5)), ("CG", (70, 30))):
+        engine = make_engine("jax", mujoco.MjModel.from_xml_string(text.format(solver)), 1)
+        assert (engine._mujoco_model.opt.iterations, engine._mujoco_model.opt.ls_iterations) == expected
+    assert (
+        make_engine("jax", mujoco.MjModel.from_xml_string(text.format("CG")), 1, iterations=9)._mujoco_model.opt.iterations == 9
+    )
+
+
+@pytest.mark.parametrize("numeric", ["max_contact_points", "max_geom_pairs"])
+def test_numbers_for_mjx_leave_out_no_contact(numeric):
+    """Three spheres on a plane, after 20 timesteps."""
+    balls = "".join(f'<body pos="{i} 0 .099"><freejoint/><geom size=".1"/></body>' for i in range(3))
+    text = f'<mujoco><custom><numeric name="{numeric}" data="1"/></custom><worldbody><geom type="plane" size="9 9 1"/>'
+    model = mujoco.MjModel.from_xml_string(f"{text}{balls}</worldbody></mujoco>")
+    still = Physics(jnp.asarray(model.qpos0, jnp.float32), *(jnp.zeros(n) for n in (model.nv, model.nv, 0)))
+    controls = Controls(jnp.zeros(0), jnp.zeros((0, 7)))
+    moved = [jax.jit(make_engine(name, model, 20).advance)(still, controls).qpos for name in ("jax", "native")]
+    np.testing.assert_allclose(*moved, atol=1e-5)
+
+
 def test_what_mjx_computes_otherwise_is_rejected():
     joint = '<mujoco><option integrator="{}">{}</option><worldbody><body><joint name="a" damping="1"/><geom size="1"/></body>'
     joint += '</worldbody><actuator><muscle name="biceps" joint="a" lengthrange="-1 1"/></actuator></mujoco>'

@@ -11,7 +11,7 @@ import pytest
 from conftest import refuses
 
 from mjx_dher import envs
-from mjx_dher.envs import wrappers
+from mjx_dher.envs import Simulator, wrappers
 from mjx_dher.envs.kinematics import pick, rounded
 from mjx_dher.envs.observations import Entry
 from mjx_dher.envs.robot import RobotLoop
@@ -102,6 +102,17 @@ def test_a_loop_has_the_period_the_controls_and_the_observation_of_its_policy(ch
     RobotLoop(Reach("native"), policy)
     with refuses({"hz": "dt", "control": "controls"}.get(*change, "layout"), "policy"):
         RobotLoop(type("Other", (Reach,), change)("native"), policy)
+
+
+def test_actuators_with_several_inputs_are_named():
+    odd = '<body pos="0 3 1"><joint name="spare"/><geom size=".1"/></body></worldbody>'
+    text = XML.replace("</worldbody>", odd, 1).replace("</actuator>", '<pid name="odd" joint="spare"/></actuator>')
+    text = text[: text.index("<keyframe>")] + "</mujoco>"
+    with refuses("every actuator must have one input", "'odd'"):
+        type("Several", (Reach,), {"model": text})("native")
+    with refuses("every actuator must have one input", "'odd'"):
+        Simulator(mujoco.MjModel.from_xml_string(text), varied=["gain:*"])
+    Simulator(mujoco.MjModel.from_xml_string(text), varied=["mass:*"])
 
 
 class Tracked(Turn):

@@ -70,6 +70,20 @@ def beyond_defaults(model: mujoco.MjModel, concerns: Callable[[str], bool]) -> l
     return list(dict.fromkeys(features))
 
 
+def narrow_limits(model: mujoco.MjModel) -> Iterator[str]:
+    """Joints and tendons that can be at both limits at once: MuJoCo C has a row for each limit, and other engines one row."""
+    for kind in ("jnt", "tendon"):
+        limited, span, margin = (getattr(model, f"{kind}_{name}") for name in ("limited", "range", "margin"))
+        if (narrow := (limited != 0) & (span[:, 1] - span[:, 0] < 2 * margin)).any():
+            yield with_names("limits nearer to each other than twice their margin", model, kind, np.flatnonzero(narrow))
+
+
+def check_inputs(model: mujoco.MjModel) -> None:
+    """Raises ValueError if an actuator has no input or several: then inputs and actuators are numbered differently."""
+    if (others := np.flatnonzero(model.actuator_ctrlnum != 1)).size:
+        raise ValueError(with_names("every actuator must have one input, unlike some of the model", model, "actuator", others))
+
+
 def stand_alone(model: mujoco.MjModel) -> np.ndarray:
     """Whether each joint [njnt] is of a free body without other joints on it."""
     tree = model.body_treeid[model.jnt_bodyid]

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from mjx_dher.envs.engines import pairs
-from mjx_dher.envs.engines.features import beyond_defaults
+from mjx_dher.envs.engines.features import beyond_defaults, narrow_limits
 from mjx_dher.system import private_api
 from mjx_dher.system.warp_setup import wp
 
@@ -29,7 +29,7 @@ else:
 
 def unsupported(model: mujoco.MjModel) -> list[str]:
     """Features of the model that MuJoCo Warp does not support, with names of their elements."""
-    left_out = beyond_defaults(model, IGNORED.__contains__)
+    left_out = [*beyond_defaults(model, IGNORED.__contains__), *narrow_limits(model)]
     try:
         with wp.ScopedDevice("cpu"):
             private_api.mujoco_warp().put_model(model)

@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from mjx_dher.envs.engines import Controls, Physics, check_shapes, pairs
-from mjx_dher.envs.engines.features import beyond_defaults, stand_alone, with_names
+from mjx_dher.envs.engines.features import beyond_defaults, narrow_limits, stand_alone, with_names
 from mjx_dher.envs.engines.variation import Variation
 from mjx_dher.system import private_api
 from mjx_dher.types import Array
@@ -31,11 +31,15 @@ _IGNORED = (
     *("actuator_actearly", "dof_dampingpoly", "jnt_stiffnesspoly", "tendon_dampingpoly", "tendon_stiffnesspoly"),
     *("geom_surfacevel", "geom_adhesion", "geom_fluid", "geom_gap", "pair_gap", "pair_adhesion"),
 )
+_INTEGRATORS = [int(getattr(mujoco.mjtIntegrator, f"mjINT_{name}")) for name in ("EULER", "IMPLICITFAST", "RK4")]
 
 
 def _ignored(model: mujoco.MjModel, sensors: bool) -> Iterator[str]:
     """Features of a model, and of its sensors if they are read, that MJX 3.17 ignores or gets wrong without a clear error."""
     yield from beyond_defaults(model, _IGNORED.__contains__)
+    yield from narrow_limits(model)
+    if model.opt.integrator not in _INTEGRATORS:
+        yield "an integrator other than Euler, implicitfast and RK4"
     if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_SPRING | mujoco.mjtDisableBit.mjDSBL_DAMPER):
         yield "flags that disable springs or dampers"
     if apart := [i for i in np.flatnonzero(model.tendon_armature).tolist() if not _has_common_inertia(model, i)]:
@@ -135,7 +139,7 @@ class MjxEngine:
 
     Under `vmap`, the constraint solver runs until the slowest environment has converged, so its iterations are limited. With 4
     iterations, pushed objects deviate two to three times as far from recorded episodes as with 8. 100 iterations gain little
-    more (docs/fidelity.md).
+    more (docs/fidelity.md). Other solvers than Newton's need the model's own numbers of iterations.
     """
 
     name = "jax"
@@ -144,11 +148,14 @@ class MjxEngine:
         self,
         model: mujoco.MjModel,
         substeps: int,
-        iterations: int = 8,
-        ls_iterations: int = 5,
+        iterations: int | None = None,
+        ls_iterations: int | None = None,
         sensors: bool = False,
         varied: Sequence[str] = (),
     ):
+        is_newton = model.opt.solver == int(mujoco.mjtSolver.mjSOL_NEWTON)
+        usual = (8, 5) if is_newton else (model.opt.iterations, model.opt.ls_iterations)
+        iterations, ls_iterations = (own if given is None else given for given, own in zip((iterations, ls_iterations), usual))
         check_count("iterations", iterations)
         check_count("ls_iterations", ls_iterations)
         if ignored := [*_ignored(model, sensors)]:
@@ -159,6 +166,7 @@ class MjxEngine:
         _grow_for_margins(model)
         model.opt.iterations = iterations
         model.opt.ls_iterations = ls_iterations
+        model.numeric_data[:] = -1  # MJX would leave out contacts by max_contact_points and max_geom_pairs
         if not sensors:
             model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
         self._mujoco_model, self._substeps, self._equalities = model, substeps, equalities_of(model)

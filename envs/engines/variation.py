@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_dher.envs.engines.features import check_inputs
 from mjx_dher.envs.engines.pairs import too_slippery
 from mjx_dher.envs.kinematics import names_of, pick
 from mjx_dher.lookup import check_name
@@ -52,6 +53,8 @@ class Variation:
         for number, name in enumerate(self.names):
             kind, _, patterns = name.partition(":")
             check_name("kind of varied physics", kind, _OBJECTS)
+            if kind == "gain":
+                check_inputs(model)
             chosen = _choose(model, name, kind, patterns)
             of_kind = numbers.setdefault(kind, np.full(len(names_of(model, _OBJECTS[kind])), self.size))
             if twice := [names_of(model, _OBJECTS[kind])[i] for i in chosen if of_kind[i] < self.size]:

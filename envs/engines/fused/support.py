@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from mjx_dher.envs.engines.features import beyond_defaults, stand_alone, with_names
+from mjx_dher.envs.engines.features import beyond_defaults, narrow_limits, stand_alone, with_names
 from mjx_dher.envs.engines.fused import setup
 from mjx_dher.envs.engines.pairs import all_pairs, too_slippery, types_of
 
@@ -81,8 +81,6 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
         ("jnt", "ball joints"): ~scalar & (model.jnt_type != _FREE),
         ("jnt", "springs of free joints"): (model.jnt_stiffness != 0) & ~scalar,
         ("jnt", "limits of free joints"): (model.jnt_limited != 0) & ~scalar,
-        ("jnt", "limits nearer to each other than twice their margin"): _narrow(model, "jnt"),
-        ("tendon", "limits nearer to each other than twice their margin"): _narrow(model, "tendon"),
         ("tendon", "tendons that are not fixed"): _not_fixed(model),
         ("jnt", "free bodies, with implicitfast, that have parts or are not centred on their mass"): _off_centre(model),
         ("actuator", "actuators that are not affine"): ~np.isin(model.actuator_biastype, biases),
@@ -92,6 +90,7 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
     for (kind, what), which in features.items():
         if which.any():
             yield with_names(what, model, kind, np.flatnonzero(which))
+    yield from narrow_limits(model)
     if model.opt.integrator not in (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
         yield "an integrator other than Euler and implicitfast"
     if model.opt.disableflags & ~_KNOWN_FLAGS:
@@ -103,12 +102,6 @@ def _restrictions(model: mujoco.MjModel) -> Iterator[str]:
     others = [eq for eq in range(model.neq) if not _is_known(model, eq)]
     if others:
         yield with_names("equality constraints other than of joints, fixed tendons and bodies", model, "eq", others)
-
-
-def _narrow(model: mujoco.MjModel, kind: str) -> np.ndarray:
-    """Joints or tendons that can be at both limits at once: MuJoCo C has a row for each limit, and the kernel one row."""
-    limited, span, margin = (getattr(model, f"{kind}_{name}") for name in ("limited", "range", "margin"))
-    return (limited != 0) & (span[:, 1] - span[:, 0] < 2 * margin)
 
 
 def _not_fixed(model: mujoco.MjModel) -> np.ndarray:
