@@ -193,11 +193,10 @@ def test_what_only_mujoco_c_computes_is_rejected():
 def test_cg_has_the_model_s_iterations():
     text = '<mujoco><option solver="{}" iterations="70" ls_iterations="30"/><worldbody/></mujoco>'
     for solver, expected in (("Newton", (8, 5)), ("CG", (70, 30))):
-        engine = make_engine("jax", mujoco.MjModel.from_xml_string(text.format(solver)), 1)
-        assert (engine._mujoco_model.opt.iterations, engine._mujoco_model.opt.ls_iterations) == expected
-    assert (
-        make_engine("jax", mujoco.MjModel.from_xml_string(text.format("CG")), 1, iterations=9)._mujoco_model.opt.iterations == 9
-    )
+        model = mujoco.MjModel.from_xml_string(text.format(solver))
+        options = make_engine("jax", model, 1)._mujoco_model.opt
+        assert (options.iterations, options.ls_iterations) == expected
+        assert make_engine("jax", model, 1, iterations=9)._mujoco_model.opt.iterations == 9
 
 
 @pytest.mark.parametrize("numeric", ["max_contact_points", "max_geom_pairs"])
