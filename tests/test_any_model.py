@@ -225,3 +225,14 @@ def test_the_benchmark_of_third_party_models_compares_with_mj_step(monkeypatch, 
     assert int(row[2]) == 12
     assert 0 <= float(row[3]) < 1e-3
     assert "no: engine warp needs" in row[4]
+
+
+def test_both_other_engines_reject_limits_within_their_margin():
+    body = '<body><joint name="j" range="-6 6" limited="true" margin="{}"/><geom size="1"/></body>'
+    near, apart = (
+        mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body.format(margin)}</worldbody></mujoco>")
+        for margin in (0.2, 0.02)
+    )
+    told = "limits nearer to each other than twice their margin ('j')"
+    assert graph.unsupported(near) == [*mjx_engine._ignored(near, False)] == [told]
+    assert graph.unsupported(apart) == [*mjx_engine._ignored(apart, False)] == []
