@@ -14,7 +14,7 @@ from mjx_dher import HParams, Options, RunSpec, envs, learners, normalizer, trai
 from mjx_dher.contract import env_spec
 from mjx_dher.parallel import mesh
 from mjx_dher.parallel import split as split_lib
-from mjx_dher.runs import driver, loop, program
+from mjx_dher.runs import driver, loop
 from mjx_dher.runs.folder import results
 from mjx_dher.types import Batch
 from probes import Explodes, PointMass, spec_of
@@ -251,14 +251,6 @@ def test_a_learner_that_cannot_be_split_is_refused():
     own = Own(learners.make("ddpg", CONFIG, env_spec(ENV)))
     with pytest.raises(ValueError, match=r"learner Own .* axis_name"):
         next(loop.train(ENV, CONFIG, learner=own, devices=2))
-
-
-@pytest.mark.parametrize(("lanes", "shape"), [(None, (4, 1)), (4, (4, 1)), (8, (4, 1)), (2, (2, 2)), (1, (1, 4))])
-def test_a_sweep_has_the_same_layout_for_any_number_of_runs_that_are_left(lanes, shape):
-    devices = mesh.find(4)
-    for number in (1, 2, 3, 6):
-        _, layout, _ = program._plan(ENV, specs_of(number), mesh.most_lanes(lanes, devices), devices, True)
-        assert (layout.lanes, layout.shards) == shape
 
 
 def test_layouts():

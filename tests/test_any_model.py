@@ -229,10 +229,8 @@ def test_the_benchmark_of_third_party_models_compares_with_mj_step(monkeypatch, 
 
 def test_both_other_engines_reject_limits_within_their_margin():
     body = '<body><joint name="j" range="-6 6" limited="true" margin="{}"/><geom size="1"/></body>'
-    near, apart = (
-        mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{body.format(margin)}</worldbody></mujoco>")
-        for margin in (0.2, 0.02)
-    )
+    texts = (f"<mujoco><worldbody>{body.format(margin)}</worldbody></mujoco>" for margin in (0.2, 0.02))
+    near, apart = map(mujoco.MjModel.from_xml_string, texts)
     told = "limits nearer to each other than twice their margin ('j')"
     assert graph.unsupported(near) == [*mjx_engine._ignored(near, False)] == [told]
     assert graph.unsupported(apart) == [*mjx_engine._ignored(apart, False)] == []

@@ -1,13 +1,14 @@
 """Calls from Python with values that are nearly right: NumPy's scalars, other shapes, names, and too many or too few."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from configs import TINY
+from configs import SMALL, TINY
 from conftest import refuses
 
 from mjx_dher import Config, HParams, RunSpec, contract, envs, gym, normalizer, relabel, samplers, trainer, validation
@@ -15,7 +16,7 @@ from mjx_dher import spec as spec_lib
 from mjx_dher.envs import Simulator
 from mjx_dher.parallel import mesh
 from mjx_dher.rollout import rollout
-from mjx_dher.runs import loop
+from mjx_dher.runs import loop, program
 from mjx_dher.runs.folder import reading, results, run_folder
 from mjx_dher.types import EnvSpec
 from point_mass import PointMass
@@ -143,6 +144,16 @@ def test_one_key_or_one_for_each_environment():
 def test_lanes_are_a_number_of_runs(lanes):
     with refuses("lanes", lanes):
         mesh.most_lanes(lanes, ())
+
+
+@pytest.mark.parametrize(("lanes", "shape"), [(None, (4, 1)), (4, (4, 1)), (8, (4, 1)), (2, (2, 2)), (1, (1, 4))])
+def test_a_sweep_has_the_same_layout_for_any_number_of_runs_that_are_left(lanes, shape):
+    devices = [SimpleNamespace(platform="gpu")] * 4
+    config = dataclasses.replace(SMALL, num_envs=8, batch_size=32, replay_size=400)
+    for number in (1, 2, 3, 6):
+        specs = [RunSpec(env="point_mass:PointMass", config=config, seed=seed) for seed in range(30, 30 + number)]
+        _, layout, _ = program._plan(PointMass(), specs, mesh.most_lanes(lanes, devices), devices, True)
+        assert (layout.lanes, layout.shards) == shape, number
 
 
 @pytest.mark.parametrize(("placed", "episodes"), [({}, 5), ({"devices": 2, "lanes": 1}, 6), ({"devices": 4, "lanes": 2}, 6)])
