@@ -28,8 +28,8 @@ class RobotLoop:
       policy: maps {"observation": [D], "desired_goal": [G]} to an action [A], such as `mjx_dher.load_policy(path)`.
 
     Raises:
-      ValueError: it is no such environment, it has a wrapper, `advance`, `step`, `observed` or `observe_goal` of your own, or
-        the policy was trained with another period, controls or observation.
+      ValueError: it is no such environment, it has an own wrapper, `advance`, `step`, `observed` or `observe_goal`, or the
+        policy was trained with another period, controls or observation.
     """
 
     def __init__(self, env: Any, policy: Callable[[Mapping[str, Any]], np.ndarray]):

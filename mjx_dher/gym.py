@@ -97,11 +97,11 @@ class _GoalApi:
         """Takes the state that a program returns. Copies its observation, reward (float64) and info to writable arrays."""
         self._state = None
         state = program(*arguments)
-        obs = _nested(dict(state.obs), np.array)
+        obs, reward = _nested(dict(state.obs), np.array), np.array(state.reward, np.float64)
         failed = getattr(state, "failed", np.zeros(np.shape(state.success), bool))
         info = {"is_success": np.array(state.success, np.float64), "failed": np.array(failed)}
         self._state = state
-        return obs, np.array(state.reward, np.float64), info
+        return obs, reward, info
 
 
 class GymEnv(_GoalApi, gymnasium.Env[Obs, np.ndarray]):

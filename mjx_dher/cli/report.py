@@ -132,31 +132,32 @@ def report_command(argv: list[str], console: Console) -> int:
         outputs.check_file(args.out, (".html",), args.overwrite)
     from mjx_dher.sweeps import comparison, report, tables
 
+    trials = tables.read(args.folder) if sweep else []
     if sweep:
-        comparison.check_baseline(comparison.groups(tables.read(args.folder)), args.baseline)
-
+        comparison.check_baseline(comparison.groups(trials), args.baseline)
     out = args.out or args.folder / report.REPORT
     settings.check_writable(out.parent)
     if args.video:
-        for run, video in _to_film(args.folder, sweep):
+        for run, video in _to_film(args.folder, trials):
             own = ("--out", str(video), "--episodes", str(EPISODES), "--overwrite", *(("--trust",) if args.trust else ()))
             cli.run("render", [str(run), *own], console)
     tell = console.print
-    page = report.of_sweep(args.folder, args.baseline, args.threshold, tell) if sweep else report.of_run(args.folder, tell)
+    if sweep:
+        page = report.of_sweep(args.folder, trials, args.baseline, args.threshold, tell)
+    else:
+        page = report.of_run(args.folder, tell)
     with files.atomic_write(out) as partial:
         partial.write_text(page, encoding="utf-8")
     console.print(f"wrote {out}")
     return 0
 
 
-def _to_film(folder: Path, sweep: bool) -> list[tuple[Path, Path]]:
-    """Run folders to draw videos of, with the files to write. For a sweep, the best run of each task."""
-    if not sweep:
+def _to_film(folder: Path, trials: Sequence[dict[str, Any]]) -> list[tuple[Path, Path]]:
+    """Run folders to draw videos of, with the files to write. For a sweep with `trials`, the best run of each task."""
+    if not trials:
         return [(folder, folder / "video.mp4")]
-    from mjx_dher.sweeps import tables
-
     best: dict[str, dict[str, Any]] = {}
-    for trial in tables.read(folder):
+    for trial in trials:
         rate = trial["final"].get("success_rate", -1.0)
         env = trial["settings"]["env"]
         if rate >= 0 and (env not in best or rate > best[env]["final"]["success_rate"]):

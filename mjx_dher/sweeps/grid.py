@@ -100,7 +100,7 @@ def train(
 ) -> list["Result"]:
     """Trains trials into the folder of a sweep, which is made if necessary. Trials share programs if possible, in any order.
 
-    `make_env` makes the environment of a trial. The options, and errors, are those of `train_runs`. Returns one Result per
+    `make_env` makes the environment of a trial. Options and errors are as in `train_runs`. Returns one Result per
     trained trial, none for those that had ended, that another process trains, or that were waiting at a stop.
     """
     from mjx_dher.parallel import processes

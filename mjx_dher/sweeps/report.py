@@ -16,7 +16,7 @@ from mjx_dher.runs.folder.fingerprint import text
 from mjx_dher.runs.folder.results import Record
 from mjx_dher.runs.folder.run_folder import FAILED
 from mjx_dher.spec import RunSpec
-from mjx_dher.sweeps import comparison, plotting, tables
+from mjx_dher.sweeps import comparison, plotting
 from mjx_dher.system import files
 from mjx_dher.tools import curves, figures
 
@@ -103,11 +103,14 @@ def _videos(folder: Path, report: Callable[[str], None]) -> Iterator[str]:
             yield _figure(f'<video controls loop muted autoplay playsinline src="{source}"></video>', path.name)
 
 
-def of_sweep(folder: Path, baseline: str, threshold: float, report: Callable[[str], None] = lambda text: None) -> str:
-    """HTML report of all finished runs of a sweep. Arguments are as in `of_run` and `comparison.compare`. Raises FolderError if
-    it is not a sweep, it is damaged, or none of its runs has ended.
-    """
-    trials = tables.read(folder)
+def of_sweep(
+    folder: Path,
+    trials: list[dict[str, Any]],
+    baseline: str,
+    threshold: float,
+    report: Callable[[str], None] = lambda text: None,
+) -> str:
+    """HTML report of a sweep with the `trials` of `tables.read`. For the others see `of_run` and `comparison.compare`."""
     failed = [trial for trial in trials if trial["status"] == FAILED]
     body = [_element("p", f"{len(trials)} runs have ended, of which {len(failed)} failed. Intervals are 95 %, over seeds.")]
     body += _videos(folder, report)
