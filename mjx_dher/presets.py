@@ -118,6 +118,10 @@ def _frugal(env: str) -> RunSpec:
     return base.replace(cycles_per_epoch=5, updates_per_cycle=200, total_steps=steps)
 
 
+def _frugal_slide(env: str) -> RunSpec:
+    return _small(_frugal(env), updates_per_cycle=150, n_step=3)
+
+
 def _entropy(env: str) -> RunSpec:
     """Base settings of the PickAndPlace presets with `tqc`."""
     return _gpu(env).replace(num_envs=512, updates_per_cycle=1000, total_steps=1_000_000, action_l2=0.0, entropy_weight=0.1)
@@ -179,8 +183,9 @@ class _Best(NamedTuple):
     changes: Mapping[str, Any] = {}  # other settings that differ from those of `setup`
 
 
+_MIRROR = {"augmentation": "mirror"}
 _DDPG = _Best("ddpg", "mlp", None)
-_PICK_AND_PLACE = _Best("tqc", "layer_norm", _pick_and_place, {"priority": "energy", "augmentation": "mirror"})
+_PICK_AND_PLACE = _Best("tqc", "layer_norm", _pick_and_place, {"priority": "energy", **_MIRROR})
 _CRL = _Best("crl", "mlp", None, {"sampler": "geometric", "action_l2": 0.0, "random_eps": 0.1})  # for each task and preset
 _LEARNERS = {  # by preset, and environment or robot
     ("cpu", "hand"): _Best("dtqc", "layer_norm", _cpu_hand, {"priority": "td_error"}),
@@ -190,18 +195,14 @@ _LEARNERS = {  # by preset, and environment or robot
     ("cpu", "hand_reach"): _Best(
         "ddpg", "mlp", lambda env: _kept(_gpu_hand_reach(env), 480_000, num_envs=64, cycles_per_epoch=5, updates_per_cycle=80)
     ),
-    ("cpu", "push"): _Best("td3", "mlp", _cpu_push, {"augmentation": "mirror"}),
+    ("cpu", "push"): _Best("td3", "mlp", _cpu_push, _MIRROR),
     ("cpu", "pick_and_place"): _PICK_AND_PLACE,
-    ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error_shared", "augmentation": "mirror"}),
-    ("gpu", "push"): _Best("ddpg", "mlp", None, {"augmentation": "mirror"}),
+    ("cpu", "slide"): _Best("dtqc", "layer_norm", _cpu_slide, {"priority": "td_error_shared", **_MIRROR}),
+    ("gpu", "push"): _Best("ddpg", "mlp", None, _MIRROR),
     ("gpu", "hand_reach"): _Best("ddpg", "mlp", _gpu_hand_reach),
     ("gpu", "pick_and_place"): _PICK_AND_PLACE,
     ("gpu", "slide"): _Best("dtqc", "layer_norm", _gpu_slide, {"priority": "td_error"}),
-    ("frugal", "push"): _Best("td3", "mlp", lambda env: _frugal(env).replace(noise_std=0.6), {"augmentation": "mirror"}),
-    ("frugal", "pick_and_place"): _Best(
-        "tqc", "layer_norm", lambda env: _kept(_entropy(env), 320_000, num_envs=64), {"augmentation": "mirror"}
-    ),
-    ("frugal", "slide"): _Best(
-        "dtqc", "layer_norm", lambda env: _small(_frugal(env), updates_per_cycle=150, n_step=3), {"priority": "td_error"}
-    ),
+    ("frugal", "push"): _Best("td3", "mlp", lambda env: _frugal(env).replace(noise_std=0.6), _MIRROR),
+    ("frugal", "pick_and_place"): _Best("tqc", "layer_norm", lambda env: _kept(_entropy(env), 320_000, num_envs=64), _MIRROR),
+    ("frugal", "slide"): _Best("dtqc", "layer_norm", _frugal_slide, {"priority": "td_error", **_MIRROR}),
 }

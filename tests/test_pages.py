@@ -195,7 +195,7 @@ def test_the_table_of_presets_is_that_of_the_file():
 
 FIRST_UNSEEN = {  # where not 600: the preset had changed since
     ("gpu", "push"): 750,
-    **dict.fromkeys((("cpu", "pick_and_place"), ("cpu", "slide"), ("frugal", "push")), 620),
+    **dict.fromkeys((("cpu", "pick_and_place"), ("cpu", "slide"), ("frugal", "push"), ("frugal", "pick_and_place")), 620),
     **{("gpu", name): 620 for name in ("pick_and_place", "egg_rotate")},
     **{("gpu", f"block_rotate_{name}"): 620 for name in ("z", "parallel", "xyz")},
 }

@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 from conftest import ROOT
+from test_presets import interval
 from test_tables_by_scipy import with_interval
 
 from mjx_dher import presets
@@ -53,11 +54,41 @@ def test_pick_and_place_learns_in_fewer_steps():
     assert f"images take {reached.min():,.0f} to {reached.max():,.0f}, and two end at {lost}." in mirror
     lowest = f"the lowest ends at {images[1].min():.3f}, which is {np.median(images[1]) - images[1].min():.3f} below the median"
     assert lowest in mirror
-    assert f"and PickAndPlace in {first}, the medians" in page("../real_robot")
-    for steps, seed in itertools.product((192_000, 224_000), (720, 620)):
-        _, last, reached = runs("frugal", "pick_and_place", "mirror", steps, seed, 10)
-        numbers = f"{with_interval(last, '{:.3f} ({:.3f} to {:.3f})')} | {last.min():.3f} | {(reached < np.inf).sum()} of 10"
-        assert f"| {steps:,} | {seed} to {seed + 9} | {numbers} |" in mirror
+    form, tens = "{:.3f} ({:.3f} to {:.3f})", {}
+    for steps, seed in (*itertools.product((192_000, 224_000), (720, 620)), (320_000, 720)):
+        for setting in ("mirror", "lr_end") if steps < 320_000 else ("preset",):
+            _, last, reached = tens[setting, steps, seed] = runs("frugal", "pick_and_place", setting, steps, seed, 10)
+            rates = {"mirror": "", "lr_end": f", {1 - 0.95 * steps / 320_000:.3g}", "preset": ", 0.05 (the preset)"}[setting]
+            numbers = f"{with_interval(last, form)} | {last.min():.3f} | {(reached < np.inf).sum()} of 10"
+            assert f"| {steps:,}{rates} | {seed} to {seed + 9} | {numbers} |" in mirror
+    _, whole, reached = tens["preset", 320_000, 720]
+    again = f"{np.median(reached):,.0f} steps in the median of these ten ({reached.min():,.0f} to {reached.max():,.0f})"
+    assert again in mirror
+    loses, gains = [], []
+    for steps in (192_000, 224_000):
+        loses.append(with_interval(whole - tens["lr_end", steps, 720][1], form))
+        smaller, larger = (np.concatenate([tens[s, steps, seed][1] for seed in (720, 620)]) for s in ("mirror", "lr_end"))
+        gains.append(with_interval(larger - smaller, form))
+        assert np.mean(whole - tens["lr_end", steps, 720][1]) > 0.01  # so, by the plan, neither becomes the preset
+    assert "192,000 steps lose {}, and 224,000 lose {},".format(*loses) in mirror
+    assert "it is {} with 192,000 steps, and {} with 224,000".format(*gains) in mirror
+    assert "lr_end` 0.43 and 0.335" in mirror
+    with (ROOT / "docs" / "unseen_runs.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if (row["learner"], row["task"]) == ("frugal", "pick_and_place")]
+    last, reached = np.array([(float(row["final"]), float(row["steps"])) for row in rows]).T
+    unseen = (
+        f"end at {with_interval(last, form)}, with {last.min():.3f} at least. 0.90 comes after {np.median(reached):,.0f} steps"
+    )
+    assert unseen in mirror
+    assert f"and PickAndPlace in {np.median(reached):,.0f}, the medians of [twenty and ten" in page("../real_robot")
+
+
+def test_slide_with_few_steps():
+    late, last = zip(*(runs("frugal", "slide", setting, 1_000_000, 710, 20)[:2] for setting in ("plain", "mirror")))
+    assert interval(late[1] - late[0])[1] > 0  # the plan's bound
+    lows = [f"{side.min():.3f}, {np.median(side) - side.min():.3f} below" for side in last[::-1]]
+    assert "ends at {} the median. Without images it is {}.".format(*lows) in page("preset_mirror")
+    assert presets.preset("frugal", "slide").config.augmentation == "mirror"
 
 
 def test_a_shorter_slide_ends_lower():

@@ -28,7 +28,12 @@ def test_presets_know_the_robot_by_its_built_in_name():
 def test_which_presets_have_mirror_images():
     """All learners of a preset, so that they can be compared, but `crl`."""
     of = lambda name, env, learner: presets.preset(name, env, learner).config.augmentation  # noqa: E731
-    with_images = {"push": ("cpu", "gpu", "frugal"), "pick_and_place": ("cpu", "gpu", "frugal"), "slide": ("cpu",), "reach": ()}
+    with_images = {
+        "push": ("cpu", "gpu", "frugal"),
+        "pick_and_place": ("cpu", "gpu", "frugal"),
+        "slide": ("cpu", "frugal"),
+        "reach": (),
+    }
     for env, names in with_images.items():
         for name in presets.PRESETS:
             expected = "mirror" if name in names else "none"
