@@ -14,8 +14,8 @@ import numpy as np
 
 from mjx_dher.contract import check_steps
 from mjx_dher.policy import TrainedPolicy
+from mjx_dher.rates import wilson_interval
 from mjx_dher.rollout import Outcome, rollout
-from mjx_dher.stats import wilson_interval
 from mjx_dher.types import Array, Env, EnvSpec, GoalObs, PRNGKey, check_size
 
 CHUNK = 500  # episodes at once

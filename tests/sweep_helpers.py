@@ -2,7 +2,6 @@
 
 import csv
 import dataclasses
-import math
 
 import pytest
 from configs import SMALL
@@ -25,14 +24,16 @@ def compile_once():
     """Tests and fixtures of a module that imports it share compiled programs, which have no state."""
     compile_runs = program.compile_runs
 
-    def cached(env, specs, max_lanes, final_episodes, report, devices=(), sweep=False):
+    def cached(env, specs, max_lanes, final_episodes, report, devices=(), sweep=False, together=1):
         choices = str(program.choices_of(specs))
-        lanes = min(len(specs), max_lanes or len(specs))
-        lanes = math.ceil(len(specs) / math.ceil(len(specs) / lanes))
+        lanes = program.equal_lanes(len(specs), min(len(specs), max_lanes or len(specs)), 1, together)
         key = (type(env), specs[0].program, choices, lanes, final_episodes, machine.available_bytes, devices, sweep)
         if key not in _compiled:
             lines = []
-            _compiled[key] = (compile_runs(env, specs, max_lanes, final_episodes, lines.append, devices, sweep), lines)
+            _compiled[key] = (
+                compile_runs(env, specs, max_lanes, final_episodes, lines.append, devices, sweep, together),
+                lines,
+            )
         compiled, lines = _compiled[key]
         for line in lines:
             report(line)

@@ -51,7 +51,7 @@ def test_lanes_of_a_checkpoint_are_filled_up_or_left_out():
         (four, three, 4, four),  # of other runs: who restores them refuses them
         (three, one, 3, three),
     ):
-        found = restoring._fit_lanes(before, after, runs)
+        found = restoring._fit_lanes(before, after, range(runs))
         assert found.keys() == expected.keys()
         for name in expected:
             np.testing.assert_array_equal(found[name], expected[name], err_msg=name)

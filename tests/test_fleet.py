@@ -137,12 +137,16 @@ def test_a_run_comes_back_whole_and_once(trained, tmp_path):
     target = grid.folder_of(tmp_path, trial)
     (target / "checkpoints" / "epoch-000001").mkdir(parents=True)  # of a run without Ray
     (target / "metrics.csv").write_text("cut")
-    worker.unpack(target, trial, parcel)
+    assert worker.unpack(target, trial, parcel)
     assert results.is_done(target, trial)
     assert not (target / "checkpoints").exists()
     assert worker.pack(target) == parcel
     written = (target / "result.json").stat().st_mtime_ns
-    worker.unpack(target, trial, parcel)
+    assert not worker.unpack(target, trial, parcel)
+    chunk = chunks.make((trial,), Options(), None, chunks.Task(0, 1), tmp_path / "storage", {})
+    chunks.make_folder(chunk)
+    assert cluster._deliver(tmp_path, chunk, [parcel], pytest.fail) == 0  # it had ended before
+    assert not (tmp_path / "storage" / chunk.id).exists()
     assert (target / "result.json").stat().st_mtime_ns == written
     assert len(tables.read(tmp_path)) == 1
 

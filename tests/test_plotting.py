@@ -99,3 +99,8 @@ def test_a_table_is_never_cut(width, terminal):
         for part in row:
             assert part in text
     assert "\u2026" not in text
+
+
+def test_curves_differ_in_colour_or_line():
+    looks = [(colour, line) for colour, line, _ in figures.styles(49)]
+    assert len(set(looks)) == 49

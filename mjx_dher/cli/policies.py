@@ -234,7 +234,7 @@ def transfer_command(argv: list[str], console: Console) -> int:
     common.settle_compiler(args.engine or run.engine)
     from mjx_dher.evaluate import play_policy, summarize
     from mjx_dher.policy.load import check_fits, load_plain
-    from mjx_dher.stats import difference_interval
+    from mjx_dher.rates import difference_interval
     from mjx_dher.system.machine import usable_cores
     from mjx_dher.tools import transfer
 

@@ -261,16 +261,16 @@ def train(
 
 
 def _deliver(folder: Path, chunk: Chunk, parcels: Sequence[bytes], report: Callable[[str], None]) -> int:
-    """Writes the ended runs of a chunk, and removes its checkpoints if all have ended. Returns their number."""
-    written = 0
+    """Writes the ended runs of a chunk, and removes its checkpoints if all have ended. Returns how many had not before."""
+    ended = new = 0
     for spec, parcel in zip(chunk.specs, parcels):
         place = grid.folder_of(folder, spec)
         try:
             if parcel:
-                worker.unpack(place, spec, parcel)
-                written += 1
+                new += worker.unpack(place, spec, parcel)
+                ended += 1
         except BusyError as error:  # a process without Ray trains it
             report(f"{place} was not written: {error}")
-    if written == len(chunk.specs) and chunk.storage is not None:
+    if ended == len(chunk.specs) and chunk.storage is not None:
         shutil.rmtree(chunk.storage, ignore_errors=True)
-    return written
+    return new

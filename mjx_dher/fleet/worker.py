@@ -137,17 +137,16 @@ def pack(folder: Path) -> bytes:
     return buffer.getvalue()
 
 
-def unpack(folder: Path, spec: RunSpec, parcel: bytes) -> None:
-    """Writes an ended trial into its folder, result.json last, so that the run is complete or not ended.
-
-    An ended run that is already there stays unchanged. Raises FolderError if another process uses the folder, it is not
+def unpack(folder: Path, spec: RunSpec, parcel: bytes) -> bool:
+    """Writes an ended trial into its folder, result.json last, so that the run is complete or not ended. Returns whether it
+    did: an ended run that is already there stays unchanged. Raises FolderError if another process uses the folder, it is not
     writable, or the bytes are not this complete trial.
     """
     try:
         files.make_folder(folder)
         with files.lock(folder), zipfile.ZipFile(io.BytesIO(parcel)) as archive:
             if results.is_done(folder, spec):
-                return
+                return False
             content = {name: archive.read(name) for name in archive.namelist()}  # checks their checksums
             (folder / run_folder.RESULT_FILE).unlink(missing_ok=True)
             for path in folder.iterdir():  # left by a run without Ray, or by a killed driver
@@ -162,3 +161,4 @@ def unpack(folder: Path, spec: RunSpec, parcel: bytes) -> None:
         raise FolderError(f"{folder}: the returned run is damaged ({error})") from error
     if (problem := results.trial_problem(folder, spec)) is not None:
         raise FolderError(f"the returned run is damaged: {problem}")
+    return True

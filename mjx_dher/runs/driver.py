@@ -20,7 +20,7 @@ from mjx_dher.contract import robot_interface
 from mjx_dher.parallel import mesh, processes
 from mjx_dher.runs import loop
 from mjx_dher.runs import program as program_lib
-from mjx_dher.runs.folder import fingerprint, loggers, run_folder
+from mjx_dher.runs.folder import fingerprint, lane_checkpoints, loggers, run_folder
 from mjx_dher.runs.folder.lane_checkpoints import LaneCheckpoints, Schedule
 from mjx_dher.runs.folder.loggers import Sink
 from mjx_dher.runs.folder.run_folder import FAILED, FINISHED, Claims, Run, named
@@ -139,7 +139,7 @@ def train_runs(
     shared = folders[0].parent / "unfinished" if shared is None else shared
     asked = lambda: processes.any_process(should_stop())  # noqa: E731
     session = _Session(env, options, asked, report, on_epoch, shared, sweep, max(1, len(placed_on)))
-    claims = Claims(sweep, report)
+    claims = Claims(sweep, report, processes.broadcast(lambda: lane_checkpoints.groups(shared, folders)))
     free = processes.broadcast(lambda: [claims.is_free(*run) for run in zip(specs, folders)])
     waiting = [run for run, is_free in zip(zip(specs, folders), free) if is_free]
     if not waiting:
@@ -149,7 +149,8 @@ def train_runs(
         _is_trained(env, *waiting[0], saved)
     with contextlib.nullcontext() if processes.is_alone() else signals.held(report, shared.parent):  # others would wait
         own, most = [spec for spec, _ in waiting], mesh.most_lanes(lanes, placed_on)
-        program = program_lib.compile_runs(env, own, most, options.final_episodes, report, placed_on, sweep)
+        alike = claims.largest(waiting)
+        program = program_lib.compile_runs(env, own, most, options.final_episodes, report, placed_on, sweep, alike)
         processes.check_equal({"lanes": program.lanes})  # by default they depend on memory
         return _train_in_turn(session, program, claims, waiting)
 
@@ -319,6 +320,13 @@ def _finish(
     watch.check_folders()
     results = []
     for lane, (spec, folder) in enumerate(zip(specs, folders)):
+        if processes.leads():
+            if lane not in failed:
+                learner = program_lib.lane_of(learners, lane, program.lanes)
+                _save_policy(session.env, program, learner, spec, folder, runs[lane])
+                files.flush(folder / run_folder.POLICY_FILE)
+            loggers.flush_logs(folder)
+    for lane, folder in enumerate(folders):  # together, because a kill in between would make the others resume
         epoch, reason = failed.get(lane, (progress.epoch, ""))
         content = {
             "status": FAILED if reason else FINISHED,
@@ -332,11 +340,6 @@ def _finish(
         if not reason:
             content |= evaluate.summarize(*(x[lane] for x in outcome[:4]))
         if processes.leads():
-            if not reason:
-                learner = program_lib.lane_of(learners, lane, program.lanes)
-                _save_policy(session.env, program, learner, spec, folder, runs[lane])
-                files.flush(folder / run_folder.POLICY_FILE)
-            loggers.flush_logs(folder)
             files.write_json(folder / run_folder.RESULT_FILE, content)
         results.append(Result(folder, str(content["status"]), epoch, progress.num_epochs, content))
     return results

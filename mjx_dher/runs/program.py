@@ -127,8 +127,9 @@ def compile_runs(
     report: Callable[[str], None],
     devices: Sequence[Any] = (),
     sweep: bool = False,
+    together: int = 1,
 ) -> Program:
-    """Compiles for as many lanes as allowed and as fit into memory, by the compiler's estimate.
+    """Compiles for as many lanes as allowed and as fit into memory, by the compiler's estimate (`equal_lanes`).
 
     In a `sweep`, whether devices share a run depends on `max_lanes` alone, because fewer runs are left at its next start.
     The final evaluation may still be compiling in a thread while the runs are trained. Raises ValueError for too little memory
@@ -141,8 +142,7 @@ def compile_runs(
         available //= layout.sharers
         lanes = max(1, min(lanes, int(available / train.replay_bytes)))
     while True:
-        chunks = math.ceil(len(specs) / (lanes * layout.lanes))
-        lanes = math.ceil(len(specs) / (chunks * layout.lanes))  # chunks of equal size
+        lanes = equal_lanes(len(specs), lanes, layout.lanes, together)
         keys, hparams = stack(specs, choices, lanes * layout.lanes)
         report(f"{spec.env}: compiling for {_title(env, specs, train, lanes * layout.lanes, layout)} ...")
         started = time.perf_counter()
@@ -156,6 +156,14 @@ def compile_runs(
             evaluate = _compile_evaluation(train, keys, hparams, final_episodes, beside, layout)
             return Program(lanes * layout.lanes, layout, choices, train.learner, train.spec, compiled, evaluate)
         lanes = min(lanes - 1, max(1, int(0.95 * lanes * available / compiled.nbytes)))
+
+
+def equal_lanes(runs: int, most: int, groups: int, together: int) -> int:
+    """Lanes of each of `groups` devices, at most `most`, with which chunks of the runs have equal sizes. If `together` runs,
+    which share a checkpoint, need more, as many as they need.
+    """
+    chunks = math.ceil(runs / (most * groups))
+    return min(most, math.ceil(max(runs / chunks, together) / groups))
 
 
 def _title(env: Env, specs: Sequence[RunSpec], train: Train, lanes: int, layout: Layout) -> str:

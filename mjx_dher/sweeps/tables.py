@@ -64,7 +64,7 @@ def _read_trial(path: Path) -> dict[str, Any]:
             "status": result["status"],
             "reason": result["reason"],
             "lanes": result["lanes"],
-            "final": {} if failed else {name: _short(result[name]) for name in _FINAL},
+            "final": {} if failed else {name: _short(result.get(name)) for name in _FINAL},
             "curve": {name: [row[name] for row in rows] for name in columns},
         }
     except (ValueError, KeyError, TypeError) as error:

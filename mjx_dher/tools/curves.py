@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mjx_dher.components import reads
+from mjx_dher.rates import wilson_interval
 from mjx_dher.runs.folder import fingerprint, results, run_folder
 from mjx_dher.runs.folder.results import Record
 from mjx_dher.runs.folder.run_folder import FAILED
-from mjx_dher.stats import wilson_interval
 from mjx_dher.system.files import FolderError
 from mjx_dher.tools import figures
 

@@ -9,7 +9,7 @@ import textwrap
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from mjx_dher import lookup
 from mjx_dher.system import files
@@ -49,8 +49,9 @@ def preload() -> None:
 
 
 def styles(number: int) -> list[tuple[Any, Any, str]]:
-    """Colour, line and marker of each of `number` curves."""
-    return [_STYLES[i % len(_STYLES)] for i in range(number)]
+    """Colour, line and marker of each of `number` curves. The first 49 differ in colour or line."""
+    one = lambda i, part: cast("Any", _STYLES[i % len(_STYLES)][part])  # noqa: E731
+    return [(one(i, 0), one(i + (rounds := i // len(_STYLES)), 1), one(i + 2 * rounds, 2)) for i in range(number)]
 
 
 def subplots(rows: int, columns: int, width: float, height: float, **options: Any) -> tuple[Any, list[Any]]:

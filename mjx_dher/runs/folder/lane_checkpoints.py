@@ -46,12 +46,14 @@ class LaneCheckpoints:
 
     @property
     def folder(self) -> Path:
-        """Folder that contains `checkpoints/`: an existing one of these runs, with any number of lanes, or a new one."""
-        shared = self.shared / fingerprint.sha256_of([self.lanes, *self.names])[:10]
-        if not shared.exists():
-            others = (path.parent for path in sorted(self.shared.glob(f"*/{NAMES_FILE}")) if _names(path) == self.names)
-            shared = next(others, shared)
-        return shared if self.lanes > 1 or shared.exists() else self.folders[0]
+        """Folder to whose `checkpoints/` these runs write."""
+        return self.shared / fingerprint.sha256_of(self.names)[:10] if self.lanes > 1 else self.folders[0]
+
+    def _sources(self) -> dict[Path, list[int]]:
+        """Folders with checkpoints of at least these runs, the latest first, and the places of the runs in them."""
+        held = {self.folder: self.names} | _held(self.shared, self.folders)
+        having = [folder for folder, names in held.items() if {*names} >= {*self.names} and _newest(folder)]
+        return {folder: [*map(held[folder].index, self.names)] for folder in sorted(having, key=_newest, reverse=True)}
 
     def restore(self, init: Callable[[], TrainState], will_save: bool) -> Start:
         """Restores the newest checkpoint. Without one, the runs start with the state from `init`. Raises FolderError if no
@@ -65,12 +67,11 @@ class LaneCheckpoints:
         del state  # memory may not suffice for two
         try:
             restored = self._read(template)
-            self._compare(restored)
         except FolderError as error:
             if not self.restart:
                 raise
             self.report(f"{error}; these runs start over")
-            self.refused.extend(run_folder.checkpoints(self.folder))
+            self.refused.extend(path for folder in self._sources() for path in run_folder.checkpoints(folder))
             return Start(init())
         for path, why in restored.refused.items():
             self.report(f"not used: {why}")
@@ -81,13 +82,10 @@ class LaneCheckpoints:
         return Start(dataclasses.replace(restored.state, hparams=hparams), restored.epoch, restored.wall_seconds)
 
     def _find(self, state: TrainState, will_save: bool) -> bool:
-        """Whether there is a checkpoint. Reports runs that begin again, and a disk too full for another checkpoint. Raises
-        FolderError if it is too full for the first.
+        """Whether there is a checkpoint. Reports a disk too full for another one. Raises FolderError if it is too full for the
+        first.
         """
-        has_some = bool(run_folder.checkpoints(self.folder))
-        held = {name for path in self.shared.glob(f"*/{NAMES_FILE}") for name in _names(path)} & {*self.names}
-        if held and not has_some:
-            self.report(f"{len(held)} of these runs begin again, because they share a checkpoint with other runs than before")
+        has_some = bool(self._sources())
         if will_save and (lack := checkpoint.lack_of_space(self.folder, state)):
             if not has_some:
                 raise FolderError(f"{self.folder}: {lack}")
@@ -99,10 +97,16 @@ class LaneCheckpoints:
         from mjx_dher.runs.folder import restoring, results
 
         problem: FolderError | None = None
-        try:
-            restored = restoring.restore(self.folder, template, [len(results.read_metrics(folder)) for folder in self.folders])
-        except FolderError as error:
-            problem = error
+        for source, places in self._sources().items():
+            if problem is not None:
+                self.report(str(problem))
+            try:
+                restored = restoring.restore(source, template, [len(results.read_metrics(run)) for run in self.folders], places)
+                self._compare(restored)
+                problem = None
+                break
+            except FolderError as error:
+                problem = error
         if processes.any_process(problem is not None):
             raise problem or FolderError(f"another process cannot read {self.folder}: all must share one file system")
         processes.check_equal({"checkpoint": restored.path})
@@ -114,8 +118,6 @@ class LaneCheckpoints:
 
     def _compare(self, restored: "Restored") -> None:
         """Reports changes of settings since the checkpoint. Raises FolderError for settings that must not change."""
-        if len(restored.runs) != len(self.runs):
-            raise FolderError(f"{restored.path} has {len(restored.runs)} runs, not {len(self.runs)}")
         from mjx_dher.runs.folder import reading
 
         changed: dict[str, str] = {}
@@ -189,6 +191,23 @@ def remove_ended(storage: Path, names_file: str, cells: Path) -> None:
             shutil.rmtree(path.parent, ignore_errors=True)
     with contextlib.suppress(OSError):  # not empty, or never made
         storage.rmdir()
+
+
+def groups(shared: Path, folders: Sequence[Path]) -> dict[str, str]:
+    """The folder of the latest checkpoint of each run in `folders` that has one. Runs with the same one resume together."""
+    held, own = _held(shared, folders), {folder.name for folder in folders}
+    return {name: str(folder) for folder in sorted(held, key=_newest) for name in held[folder] if name in own}
+
+
+def _held(shared: Path, folders: Sequence[Path]) -> dict[Path, list[str]]:
+    """Names of the runs of each folder with a checkpoint: shared ones, and the runs' own."""
+    held = {path.parent: _names(path) for path in sorted(shared.glob(f"*/{NAMES_FILE}"))}
+    return {folder: names for folder, names in (held | {own: [own.name] for own in folders}).items() if _newest(folder)}
+
+
+def _newest(folder: Path) -> int:
+    """Epoch of the newest checkpoint, or 0."""
+    return max(map(run_folder.epoch_of, run_folder.checkpoints(folder)), default=0)
 
 
 def _names(path: Path) -> list[str]:

@@ -37,8 +37,7 @@ _CONFIG: Form = {
     "digest": _DIGEST,
     "earlier?": [_DIGEST],
     "jax_flags?": dict,
-    "lanes?": _LANES,
-    "devices?": _LANES,
+    **dict.fromkeys(("lanes?", "devices?", "final_episodes?"), _LANES),
     "interface?": dict,
     "versions?": {"*": str},
 }
@@ -47,7 +46,7 @@ RESULT: Form = {
     "reason": str,
     "digest": _DIGEST,
     "lanes": _LANES,
-    "epochs": _COUNT,
+    "epochs": (int, "[1, 9000000000000000000]"),
     "env_steps": _COUNT,
     "wall_seconds": _AMOUNT,
 }

@@ -33,12 +33,13 @@ class Restored(NamedTuple):
     failed: dict[int, tuple[int, str]]  # epoch and reason of each failed lane
 
 
-def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
-    """Restores the newest undamaged checkpoint of a run.
+def restore(folder: Path, template: Any, lines: Sequence[int] = (), places: Sequence[int] = ()) -> Restored:
+    """Restores the newest undamaged checkpoint of a run, or of parallel runs.
 
     Args:
       template: structure of the state (`jax.ShapeDtypeStruct`s), with shardings if there are several devices.
       lines: epochs in metrics.csv of each run. Checkpoints of later epochs are not used.
+      places: which runs of the checkpoint to restore, in this order. Default: all.
 
     Raises:
       FolderError: there is no checkpoint.
@@ -49,25 +50,29 @@ def restore(folder: Path, template: Any, lines: Sequence[int] = ()) -> Restored:
         try:
             with checked(path):
                 manifest = read_manifest(path)
-                failed = _check_lines(path, manifest, lines)
-                arrays = _load(path, manifest, template)
-            state = _place(arrays, template)
-            return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, manifest["runs"], refused, failed)
+                runs = manifest["runs"]
+                own = places or range(len(runs)) or (0,)
+                if places and max(places) >= len(runs):
+                    raise CheckpointError(f"{path} has {len(runs)} runs, and not number {1 + max(places)}")
+                ended = {int(place): failure for place, failure in manifest["failed"].items()}
+                failed = {lane: ended[place] for lane, place in enumerate(own) if place in ended}
+                _check_lines(path, manifest["epoch"], failed, lines)
+                arrays = _load(path, manifest, template, own)
+            state, runs = _place(arrays, template), [runs[place] for place in own] if runs else []
+            return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, runs, refused, failed)
         except FolderError as error:
             refused[path] = str(error)
     raise CheckpointError(f"{folder} has no checkpoint to resume from: " + "\n".join(refused.values()))
 
 
-def _check_lines(path: Path, manifest: Mapping[str, Any], lines: Sequence[int]) -> dict[int, tuple[int, str]]:
-    """Failed runs. Raises CheckpointError if a run's metrics.csv lacks epochs that had ended."""
-    failed = {int(lane): (epoch, reason) for lane, (epoch, reason) in manifest["failed"].items()}
+def _check_lines(path: Path, epoch: int, failed: Mapping[int, Sequence[Any]], lines: Sequence[int]) -> None:
+    """Raises CheckpointError if a run's metrics.csv lacks epochs that had ended."""
     for lane, whole in enumerate(lines):
-        if whole < (failed[lane][0] - 1 if lane in failed else manifest["epoch"]):  # the epoch that failed has no line
+        if whole < (failed[lane][0] - 1 if lane in failed else epoch):  # the epoch that failed has no line
             raise CheckpointError(f"{path} has a later epoch than the last complete line of metrics.csv, {whole}")
-    return failed
 
 
-def _load(path: Path, manifest: Mapping[str, Any], template: Any) -> list[np.ndarray]:
+def _load(path: Path, manifest: Mapping[str, Any], template: Any, places: Sequence[int]) -> list[np.ndarray]:
     present = {file.relative_to(path).as_posix() for file in files_of(path)}
     for name, digest in manifest["files"].items():
         if name not in present:  # this also excludes files of other folders
@@ -82,22 +87,23 @@ def _load(path: Path, manifest: Mapping[str, Any], template: Any) -> list[np.nda
         if (held := _say(name, arrays[name])) != (saved := f"{name} {dtype}{shape}"):
             raise CheckpointError(f"{path} was written as {saved} but read as {held}")
     shapes = to_shapes(template)
-    arrays = _fit_lanes(arrays, shapes, len(manifest["runs"]))
+    arrays = _fit_lanes(arrays, shapes, places)
     return _fit(path, _deal(arrays, shapes), shapes)
 
 
-def _fit_lanes(arrays: dict[str, np.ndarray], shapes: Mapping[str, Any], runs: int) -> dict[str, np.ndarray]:
-    """Arrays of the saved `runs`, with the last one repeated up to the number of lanes in `shapes`.
+def _fit_lanes(arrays: dict[str, np.ndarray], shapes: Mapping[str, Any], places: Sequence[int]) -> dict[str, np.ndarray]:
+    """Arrays of the runs at `places`, with the last one repeated up to the number of lanes in `shapes`.
 
-    A program may have more lanes than runs. A single run has no lane axis.
+    A program may have more lanes than runs. A single run has no lane axis. Arrays of too few lanes stay as they are.
     """
     if _STEPS not in arrays or _STEPS not in shapes:
         return arrays  # not a TrainState
     saved, needed = arrays[_STEPS].shape, tuple(shapes[_STEPS].shape)
-    if saved == needed or not 1 <= runs <= min(*(saved or (1,)), *(needed or (1,))):
+    every = [*range(*(saved or (1,)))]
+    lanes: Any = [places[min(lane, len(places) - 1)] for lane in range(*(needed or (1,)))]
+    if (saved == needed and lanes == every) or len(places) > len(lanes) or max(lanes) >= len(every):
         return arrays
-    lanes: Any = np.minimum(np.arange(needed[0]), runs - 1) if needed else 0
-    return {name: (array if saved else array[None])[lanes] for name, array in arrays.items()}
+    return {name: (array if saved else array[None])[lanes if needed else lanes[0]] for name, array in arrays.items()}
 
 
 def _deal(arrays: dict[str, np.ndarray], shapes: Mapping[str, Any]) -> dict[str, np.ndarray]:

@@ -188,6 +188,7 @@ class Claims:
 
     sweep: bool  # skip runs that have ended or that another process trains, instead of raising
     report: Callable[[str], None]
+    groups: Mapping[str, str] = dataclasses.field(default_factory=dict)  # of folders' names: `lane_checkpoints.groups`
 
     def is_free(self, spec: RunSpec, folder: Path) -> bool:
         """Whether to train a run, as far as known before compilation. Raises FolderError if not, except in a sweep."""
@@ -202,16 +203,19 @@ class Claims:
             return False
 
     def claim(self, stack: contextlib.ExitStack, waiting: Sequence[Run], lanes: int) -> tuple[list[Run], list[Run]]:
-        """Makes and locks the folders of the first `lanes` runs that have not ended and that no other process trains.
+        """Makes and locks the folders of the first `lanes` runs of a group, of those that have not ended and that no other
+        process trains.
 
         Returns the claimed runs and the waiting ones, with other processes' runs last. Ended runs are in neither. Raises
         FolderError if a folder is not writable or, except in a sweep, if a run has ended or another process trains it.
         """
         claimed: list[Run] = []
+        later: list[Run] = []
         busy: list[Run] = []
-        for number, (spec, folder) in enumerate(waiting):
-            if len(claimed) == lanes:
-                return claimed, [*waiting[number:], *busy]
+        for spec, folder in waiting:
+            if claimed and (len(claimed) == lanes or self.groups.get(folder.name) != self.groups.get(claimed[0][1].name)):
+                later.append((spec, folder))
+                continue
             try:
                 with named(folder), contextlib.ExitStack() as attempt:
                     attempt.enter_context(files.made(folder))
@@ -223,7 +227,12 @@ class Claims:
                 if not self.sweep:
                     raise
                 busy.append((spec, folder))
-        return claimed, busy
+        return claimed, [*later, *busy]
+
+    def largest(self, waiting: Sequence[Run]) -> int:
+        """Runs of the largest group, at least 1."""
+        known = [self.groups[folder.name] for _, folder in waiting if folder.name in self.groups]
+        return max(map(known.count, known), default=1)
 
     def _is_due(self, spec: RunSpec, folder: Path) -> bool:
         """Whether to train a locked run. Raises FolderError if not, except in a sweep."""
