@@ -174,6 +174,11 @@ class SimulatedTask(GoalEnv):
         """Lowest and highest coordinates [2, 3] in m of the first free body after a reset."""
         return None if self._object is None else np.stack(self._object[2:])
 
+    def object_position(self, state: State) -> Array:
+        """Position [3] in m of the free body that `with_object` moves."""
+        assert self._object is not None
+        return state.physics.qpos[self._object[0] : self._object[0] + 3]
+
     def vary(self, physics: Physics, key: PRNGKey) -> Physics:
         """The physics with factors of `varied`, drawn with the key of the reset."""
         if not self._ranges:

@@ -9,6 +9,7 @@ from conftest import refuses, save_policy
 
 from mjx_dher import RunSpec, cli, policy
 from mjx_dher.runs.folder import run_folder
+from mjx_dher.system import subprocesses
 from mjx_dher.tools import transfer
 
 
@@ -39,6 +40,17 @@ def test_a_python_without_the_originals_is_refused(run, capsys):
     assert "--set-up" in message
     assert cli.main(["transfer", str(run), "--python", "/no/such/python"]) == 2
     assert "/no/such/python does not have them" in capsys.readouterr().err
+
+
+def test_files_of_the_current_folder_are_not_modules_of_the_other_python(tmp_path, monkeypatch):
+    for name in ("email", "importlib", "this"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('imported')")
+    monkeypatch.chdir(tmp_path)
+    installed = f"numpy=={np.__version__}"
+    assert transfer.is_ready(Path(sys.executable), (installed,))
+    answer = subprocesses.ask(transfer._running(Path(sys.executable), "this"))
+    assert answer.failure is None
+    assert "The Zen of Python" in answer.out
 
 
 def test_a_task_without_an_original_is_refused_before_the_download(tmp_path, monkeypatch, capsys):

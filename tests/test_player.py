@@ -1,5 +1,6 @@
 """The viewer's player, in an environment that can be computed by hand: a point on a line that goes where it is told."""
 
+import asyncio
 from types import SimpleNamespace
 
 import numpy as np
@@ -137,6 +138,27 @@ def test_a_goal_that_is_dragged_counts_once():
     assert player.own == Tally(1, 1)
 
 
+def test_an_object_is_where_the_environment_says():
+    env = SimpleNamespace(**vars(GAME.env), object_position=lambda state: state.physics.qpos + np.array([0.0, 1.0, 2.0]))
+    player = Player(GAME._replace(env=env), follow)
+    player.step()
+    np.testing.assert_allclose(player.object_position, [0.1, 1.1, 2.1], atol=1e-6)
+    player = Player(GAME, follow)
+    player.step()
+    np.testing.assert_allclose(player.object_position, [0.1, 0.0, 0.0], atol=1e-6)
+
+
+def test_a_control_s_value_is_that_of_its_event():
+    """A policy is chosen while another one compiles, at whose end the panel shows that one."""
+    commands, done = panel.Commands(), []
+    target = SimpleNamespace(value="chosen")
+    asyncio.run(panel._put(commands, "policy", done.append)(SimpleNamespace(client_id=1, target=target)))
+    target.value = "another"
+    asyncio.run(panel._put(commands, "speed", done.append)(SimpleNamespace(client_id=None, target=target)))
+    commands.run()
+    assert done == ["chosen"]
+
+
 def test_an_object_is_moved():
     player = Player(GAME, follow)
     player.move_object(np.array([0.38, 0.0, 0.0]))
@@ -251,6 +273,21 @@ def _task(name):
 @pytest.fixture(scope="module")
 def push():
     return make_game(envs.make("push", engine="native", num_threads=1))
+
+
+def test_a_custom_environment_s_goals_need_no_range_to_be_moved(push):
+    class Hidden:
+        """The task without its range of goals, but with `goal_marks`."""
+
+        def goal_marks(self, qpos, goal):
+            return []
+
+        def __getattr__(self, name):
+            if name == "goal_bounds":
+                raise AttributeError(name)
+            return getattr(push.env, name)
+
+    assert make_game(Hidden()).move_goal is not None
 
 
 def test_a_moved_cube_lies_at_rest_and_the_arm_stays(push):

@@ -124,6 +124,9 @@ def damage(run_dir, how):
     elif how == "interface":
         arrays = dict(np.load(policy_file))
         np.savez(policy_file.open("wb"), **arrays, interface=np.frombuffer(b"[1]", np.uint8))
+    elif how == "wide numbers":
+        arrays = dict(np.load(policy_file))
+        np.savez(policy_file.open("wb"), **arrays | {"layer0_kernel": arrays["layer0_kernel"].astype(np.longdouble)})
     elif how == "no policy file at all":
         policy_file.write_text("hello")
 
@@ -139,6 +142,7 @@ DAMAGES = {
     "truncated policy": ["policy.npz", "damaged"],
     "foreign policy": ["policy.npz", "damaged"],
     "interface": ["policy.npz", "interface", "[1]"],
+    "wide numbers": ["policy.npz", "layer0_kernel", "float32"],
     "no policy file at all": ["policy.npz", "damaged"],
 }
 

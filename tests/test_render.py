@@ -173,6 +173,16 @@ def test_what_is_written_can_be_read(tmp_path, suffix, count):
     assert os.listdir(tmp_path) == [f"out{suffix}"]
 
 
+def test_why_ffmpeg_was_killed_is_told(tmp_path, monkeypatch):
+    killed = tmp_path / "ffmpeg"
+    killed.write_text("#!/bin/sh\nkill -9 $$\n")
+    killed.chmod(0o700)
+    monkeypatch.setattr(render, "ffmpeg", lambda: str(killed))
+    with refuses("out", "ended with status -9"):
+        render.write_frames(tmp_path / "a.gif", iter([np.zeros((4, 4, 3), np.uint8)] * 9), 25.0)
+    assert os.listdir(tmp_path) == ["ffmpeg"]
+
+
 @pytest.mark.parametrize("name", ["12:30.gif", "-x.gif", "pic%d.png"])
 def test_names_that_ffmpeg_would_read_otherwise_are_names(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)

@@ -15,7 +15,7 @@ import pytest
 from conftest import ROOT, refuses
 
 from mjx_dher import cli, envs
-from mjx_dher.envs.task import MujocoTask, Rotation
+from mjx_dher.envs.task import Joints, MujocoTask, Rotation, Start
 from mjx_dher.policy import bundled
 from mjx_dher.viewer import address, server, sources
 
@@ -183,6 +183,28 @@ def test_a_hand_turns_the_goal(port):
         assert viewer.player.is_own
         assert viewer._panel._distance.title == "Distance to the goal, °"
         assert f"{np.degrees(viewer.player.distance):.1f} ° from the goal" in viewer._panel._score.content
+
+
+class Bent(MujocoTask):
+    """The goal is a joint's angle, and a box has a range of starts."""
+
+    model = Turn.model
+    start = Start(ranges={"box": ((0.8, -0.1, 0.0), (1.2, 0.1, 0.0))})
+    goal = Joints("a", low=-0.5, high=0.5)
+
+
+def test_an_object_is_held_where_it_is_and_not_where_the_goal_is(port):
+    source = sources.by_random("test_view:Bent")
+    with server.Viewer([source], lambda source: Bent(engine="native"), "127.0.0.1", port, 1) as viewer:
+        aimed = []
+        viewer._aim = lambda: aimed.append(1)
+        viewer.take("object")
+        np.testing.assert_allclose(viewer._handle.position, viewer.player.qpos[1:4], atol=1e-6)
+        viewer._drag("object", (np.array([1.1, 0.05, 0.0]), np.eye(4)[0]), "update")  # without a start
+        viewer.show(True)
+        np.testing.assert_allclose(viewer._handle.position, [1.1, 0.05, 0.0], atol=1e-6)
+        np.testing.assert_allclose(viewer.player.qpos[1:4], [1.1, 0.05, 0.0], atol=1e-6)
+        assert not aimed  # the cameras stay as the users have turned them
 
 
 # The commands

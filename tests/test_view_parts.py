@@ -2,6 +2,7 @@
 
 import dataclasses
 import shutil
+from pathlib import Path
 
 import jax
 import mujoco
@@ -209,6 +210,29 @@ def test_an_environment_has_the_arguments_of_its_run_or_those_given(stopped, tmp
     assert sources.of_run("mine", folder).env_kwargs == run.env_kwargs
     assert sources.of_run("mine", folder, None, ("episode_length=30",)).env_kwargs == ("episode_length=30", "reward_type=dense")
     assert sources.of_run("mine", folder, "push", ("episode_length=30",)).env_kwargs == ("episode_length=30",)
+
+
+def test_success_is_said_to_be_of_where_it_was_measured():
+    """The numbers of a policy are those of its own task, whatever it plays in."""
+    own = sources.of_run("push", bundled.FOLDER / "push")
+    other = dataclasses.replace(own, env="slide")
+    noisy = sources.of_run("push", bundled.FOLDER / "push", None, ("episode_length=20",))
+    texts = []
+    for source in (own, other, noisy):
+        cast = object.__new__(sources.Cast)
+        cast.source = source
+        texts.append(cast.about().partition(":")[0])
+    assert texts == ["`push`, trained", "`slide`, trained in `push`", "`push`, trained with other arguments"]
+
+
+def test_a_run_named_like_a_bundled_policy_is_not_replaced_by_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(bundled.FOLDER / "reach", "reach")
+    cast = sources.Cast(sources.of_run("reach", Path("reach")), reach())
+    before = cast.act
+    shutil.rmtree("reach")
+    assert not cast.refresh()
+    assert cast.act is before
 
 
 def test_a_policy_of_another_environment_is_refused():

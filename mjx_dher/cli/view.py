@@ -12,11 +12,10 @@ from typing import Any
 import tyro
 from rich.console import Console
 
-from mjx_dher import envs
+from mjx_dher import envs, lookup
 from mjx_dher.cli import parse
 from mjx_dher.cli.common import VIEW_PORT, EnvKwargs, Trust
 from mjx_dher.cli.policies import check_play, find_run, read_run
-from mjx_dher.lookup import check_name
 from mjx_dher.policy import bundled
 from mjx_dher.spec import to_arguments
 from mjx_dher.system import subprocesses
@@ -68,7 +67,7 @@ def demo_command(argv: list[str], console: Console) -> int:
     """Shows a bundled policy."""
     args = parse(DemoArgs, argv)
     first = "push" if "push" in bundled.names() else bundled.names()[0]
-    return _view(ViewArgs(runs=(Path(first),), page=args.page), console)
+    return _view(ViewArgs(runs=(bundled.FOLDER / first,), page=args.page), console)
 
 
 def view_command(argv: list[str], console: Console) -> int:
@@ -81,9 +80,10 @@ def _view(args: ViewArgs, console: Console) -> int:
     if not args.runs and args.env is None:
         raise ValueError(f"view needs run folders, bundled policies ({', '.join(bundled.names())}), or --env")
     if args.env is not None:
-        check_name("env", args.env, envs.list_envs(), custom=True)
+        lookup.check_name("env", args.env, envs.list_envs(), custom=True)
     check_play(args.seed, args.engine, env_kwargs=args.env_kwargs)
-    folders = [(str(run), find_run(run, console)) for run in args.runs]
+    places = [(run, find_run(run, console)) for run in args.runs]
+    folders = [(folder.name if bundled.is_shipped(folder) else lookup.escaped(str(run)), folder) for run, folder in places]
     for _, folder in folders:
         read_run(folder, console)
     from mjx_dher.viewer import address

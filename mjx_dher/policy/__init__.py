@@ -175,8 +175,8 @@ def read_interface(arrays: Mapping[str, Any]) -> dict[str, Any]:
 def _check_array(name: str, array: Any) -> None:
     """Raises ValueError for an array of a wrong type or rank, or with invalid values."""
     ndim = 0 if name in SCALARS else 2 if name.endswith("_kernel") else 1
-    if array.dtype.kind != "f" or array.ndim != ndim or 0 in array.shape:
-        raise ValueError(f"{name} must be floats with {ndim} axes; got {array.dtype}{list(array.shape)}")
+    if array.dtype != np.float32 or array.ndim != ndim or 0 in array.shape:
+        raise ValueError(f"{name} must be float32 with {ndim} axes; got {array.dtype}{list(array.shape)}")
     if not np.all(np.isfinite(array)):
         raise ValueError(f"{name} must be finite")
     if (name in SCALARS or name.endswith("_std")) and not np.all(array > 0):

@@ -271,4 +271,5 @@ def write_frames(out: Path, frames: Iterable[np.ndarray], fps: float) -> None:
                         process.stdin.write(np.ascontiguousarray(frame).data)
                 _, message = process.communicate()
         if process.returncode != 0:
-            raise ValueError(f"out: cannot write {out} ({message.decode(errors='replace').strip()})")
+            reason = message.decode(errors="replace").strip() or f"ffmpeg ended with status {process.returncode}"
+            raise ValueError(f"out: cannot write {out} ({reason})")

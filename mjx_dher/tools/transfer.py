@@ -40,6 +40,7 @@ ORIGINALS = {
     "pen": "HandManipulatePen-v1",
 }
 REQUIREMENTS = ("gymnasium-robotics==1.4.2", "mujoco==3.11.0")  # the tasks cannot be built on mujoco 3.12 or newer
+_ELSEWHERE = "import sys; sys.path[:] = filter(None, sys.path); "  # files of the current folder are not taken for modules
 
 
 def default_environment() -> Path:
@@ -52,7 +53,7 @@ def set_up(environment: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> N
     if is_ready(interpreter(environment), requirements):
         return
     venv.create(environment, with_pip=True, clear=True)
-    pip = (str(interpreter(environment)), "-m", "pip", "install", "--quiet", "--disable-pip-version-check")
+    pip = (*_running(interpreter(environment), "pip"), "install", "--quiet", "--disable-pip-version-check")
     answer = subprocesses.ask((*pip, *requirements))
     if answer.failure:
         raise ValueError(f"{environment} could not be set up: {answer.err.strip() or answer.failure}")
@@ -89,7 +90,7 @@ def play_apart(run: Path, python: Path, episodes: int, seed: int, workers: int) 
         processes = []
         for first, end in itertools.pairwise(bounds):
             arguments = (str(run.resolve()), str(end - first), str(seed + first))
-            command = (str(python), "-m", "mjx_dher.tools.transfer", *arguments)
+            command = (*_running(python, "mjx_dher.tools.transfer"), *arguments)
             processes.append(stack.enter_context(subprocesses.started(command, {"PYTHONPATH": str(folder)})))
         outcomes = []
         for process in processes:
@@ -128,7 +129,12 @@ def is_ready(python: Path, requirements: tuple[str, ...] = REQUIREMENTS) -> bool
     """Whether `python` exists and has the original tasks in the required versions."""
     names = [requirement.split("==")[0] for requirement in requirements]
     code = f"from importlib import metadata as m; print(*[n + '==' + m.version(n).split('+')[0] for n in {names}])"
-    return tuple(subprocesses.ask((str(python), "-c", code)).out.split()) == requirements
+    return tuple(subprocesses.ask((str(python), "-c", _ELSEWHERE + code)).out.split()) == requirements
+
+
+def _running(python: Path, module: str) -> tuple[str, ...]:
+    """Command that runs a module, which may not lie in the current folder."""
+    return str(python), "-c", f"{_ELSEWHERE}import runpy; runpy.run_module({module!r}, run_name='__main__', alter_sys=True)"
 
 
 def main(argv: Sequence[str]) -> None:

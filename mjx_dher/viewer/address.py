@@ -48,7 +48,7 @@ def is_ip(host: str) -> bool:
 
 def is_loopback(host: str) -> bool:
     """Whether an address is reachable only from this machine."""
-    return host == "localhost" or (is_ip(host) and ipaddress.ip_address(host).is_loopback)
+    return host.lower() == "localhost" or (is_ip(host) and ipaddress.ip_address(host).is_loopback)
 
 
 def is_everywhere(host: str) -> bool:

@@ -1,5 +1,6 @@
 """The panel next to the scene: policy, speed and progress. Each user action is a command; commands run in order."""
 
+import functools
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -72,34 +73,34 @@ class Panel:
         self._value = _curve(gui, "Critic's value", ("value", _BLUE))
         is_bool = lambda value: isinstance(value, bool)  # noqa: E731
         for control, is_value, command in (
-            (self._policy, labels.__contains__, lambda: choose(self._policy.value)),
+            (self._policy, labels.__contains__, choose),
             (self._play, is_bool, self._pause),
             (self._once, _ONCE.__contains__, self._act_once),
             (self._speed, lambda value: isinstance(value, float) and SPEEDS[0] <= value <= SPEEDS[1], self._settle),
-            (self._renew, is_bool, self._settle),
-            (self._taken, DRAGGED.__contains__, lambda: take(self._taken.value)),
+            (self._renew, is_bool, lambda value: player().set_renew(value)),
+            (self._taken, DRAGGED.__contains__, take),
         ):
             number = private_api.viser_control_id(control)
             controls[number] = is_value
             (control.on_click if control in (self._play, self._once) else control.on_update)(_put(commands, number, command))
 
-    def _pause(self) -> None:
+    def _pause(self, _: Any) -> None:
         self._player().playing = not self._player().playing
 
-    def _act_once(self) -> None:
-        if self._once.value == "Step":
+    def _act_once(self, action: str) -> None:
+        if action == "Step":
             self._player().playing = False
-            self._player().step()
+            self._player().step(by_hand=True)
         else:
             self._player().new_episode()
-            self._player().renew = True
 
-    def _settle(self) -> None:
-        self._player().speed, self._player().renew = float(self._speed.value), bool(self._renew.value)
+    def _settle(self, speed: float) -> None:
+        self._player().speed = float(speed)
 
     def adopt(self) -> None:
         """Applies the panel's settings to a new player."""
-        self._settle()
+        self._settle(self._speed.value)
+        self._player().set_renew(bool(self._renew.value))
         self._player().playing = self._play.label == "Pause"
 
     def name(self, label: str, about: str, critic: str, has_value: bool) -> None:
@@ -165,12 +166,12 @@ def _curve(gui: Any, label: str, *series: tuple[str, str]) -> Any:
     )
 
 
-def _put(commands: Commands, kind: str, command: Callable[[], None]) -> Callable[[Any], Any]:
-    """Viser callback that queues a command, unless the server has set the control."""
+def _put(commands: Commands, kind: str, command: Callable[[Any], None]) -> Callable[[Any], Any]:
+    """Viser callback that queues a command with the control's value, unless the server has set the control."""
 
     async def callback(event: Any) -> None:  # a coroutine, because threads could change the order
         if event.client_id is not None:
-            commands.put(kind, command)
+            commands.put(kind, functools.partial(command, event.target.value))  # the server may set another one meanwhile
 
     return callback
 

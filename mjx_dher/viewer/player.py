@@ -48,9 +48,10 @@ def make_game(env: Any) -> Game:
     Raises ValueError if the environment cannot be drawn.
     """
     check_drawable(env)
-    has_object = getattr(env, "has_object", True)  # all built-in tasks share their methods, even without an object
-    is_point = jax.eval_shape(env.reset, jax.random.key(0)).obs["desired_goal"].shape == (3,)
-    has_position = bounds(env, "goal") is not None if hasattr(env, "goal_marks") else is_point
+    goal = jax.eval_shape(env.reset, jax.random.key(0)).obs["desired_goal"].shape
+    is_point, is_placed = goal == (3,), hasattr(env, "object_position") or goal in ((3,), (7,))
+    has_object = getattr(env, "has_object", is_placed)  # all built-in tasks share their methods, even without an object
+    has_position = bounds(env, "goal") is not None if hasattr(env, "goal_bounds") else is_point
 
     def move_goal(state: Any, position: Any) -> Any:  # a pose keeps its orientation
         return env.with_goal(state, jnp.concatenate([position, state.obs["desired_goal"][3:]]))
@@ -104,9 +105,9 @@ class Tally:
 class Player:
     """A policy that plays in an environment. The first episode has the seed `seed`, and others follow.
 
-    An attempt has as many steps as an episode. It begins with a reset, or when goal or object are moved. It counts as a success
-    if the goal is reached at its last step, as in an evaluation. If `renew` is set, the next episode begins then. Moving
-    something unsets `renew`, so that a user can continue.
+    An attempt has as many steps as an episode. It begins with a reset, or when goal or object are moved. It counts once, as a
+    success if the goal is reached at its last step, as in an evaluation. If `renew` is set, the next episode begins then.
+    Moving something unsets `renew` up to the next episode, so that a user can continue.
     """
 
     def __init__(self, game: Game, act: Act, value: Value | None = None, seed: int = 1):
@@ -116,15 +117,20 @@ class Player:
         self.note = ""
         # Of the last steps: time, s; distance to the goal, m; the critic's value, or NaN.
         self.history: collections.deque[tuple[float, float, float]] = collections.deque(maxlen=game.steps(SHOWN))
-        self._seed, self._steps, self._owed = seed, 0, 0.0
+        self._seed, self._steps, self._owed, self._renews = seed, 0, 0.0, False
         self.new_episode()
 
     def new_episode(self) -> None:
         """Begins the next episode."""
         self._state = self.game.reset(np.uint32(self._seed % 2**32))
         self._seed += 1
-        self.clock, self._held, self.is_own, self.note = 0, 0, False, ""
+        self.clock, self._held, self._counts, self.is_own, self.note = 0, 0, True, False, ""
+        self.set_renew(self.renew or self._renews)
         self._look()
+
+    def set_renew(self, renew: bool) -> None:
+        """Sets whether the next episode begins by itself."""
+        self.renew, self._renews = renew, False
 
     def advance(self, seconds: float) -> int:
         """Plays for `seconds` of real time, times the speed. Returns the number of steps."""
@@ -137,10 +143,10 @@ class Player:
             self.step()
         return min(steps, most)
 
-    def step(self) -> None:
-        """Makes one step of the environment, or holds the end of an episode for one step."""
+    def step(self, by_hand: bool = False) -> None:
+        """Makes one step of the environment, or holds the end of an episode for one step, except `by_hand`."""
         if self._held:
-            self._held -= 1
+            self._held = 0 if by_hand else self._held - 1
             if not self._held:
                 self.new_episode()
             return
@@ -150,8 +156,10 @@ class Player:
         self._look()
         failed = self._flag("failed")
         ended = self._flag("done") or self._flag("terminal") or (self.game.ends_at_goal and self.success)
-        if failed or ended or self.clock == self.length:
-            (self.own if self.is_own else self.episodes).add(self.success)
+        if failed or ended or self.clock >= self.length:
+            if self._counts:
+                (self.own if self.is_own else self.episodes).add(self.success)
+            self._counts = False
             self._held = self.game.steps(HOLD) if failed or ended or self.renew else 0
         if failed:
             self.note = "The simulation diverged; a new episode begins."
@@ -183,13 +191,14 @@ class Player:
         if self._flag("failed"):  # only a reset helps
             self.new_episode()
         self._state = move(self._state, position)
-        self.clock, self._held, self.is_own, self.renew = 0, 0, True, False
+        self._renews, self.renew = self._renews or self.renew, False
+        self.clock, self._held, self._counts, self.is_own = 0, 0, True, True
         self._look()
 
     def replace(self, act: Act, value: Value | None) -> None:
-        """Continues with another policy, and resets the counters."""
+        """Continues with another policy, and resets the counters. The present attempt, which is of both, does not count."""
         self.act, self.value = act, value
-        self.episodes, self.own = Tally(), Tally()
+        self.episodes, self.own, self._counts = Tally(), Tally(), False
         self._look()
 
     @property
@@ -214,6 +223,12 @@ class Player:
         return {"m": (100.0, "cm"), "rad": (180.0 / np.pi, "°")}.get(
             getattr(getattr(self.game.env, "goal", None), "unit", "m"), (1.0, "")
         )
+
+    @property
+    def object_position(self) -> np.ndarray:
+        """Position [3] of the object, in m. It is the achieved goal's if the environment has no `object_position`."""
+        position = getattr(self.game.env, "object_position", None)
+        return np.asarray(self.obs["achieved_goal"][:3] if position is None else position(self._state))
 
     @property
     def qpos(self) -> np.ndarray:

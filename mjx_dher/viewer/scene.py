@@ -71,7 +71,7 @@ def _add_geom(scene: Any, model: Any, geom: int, rgba: np.ndarray, name: str) ->
     place = {"position": model.geom_pos[geom].copy(), "wxyz": model.geom_quat[geom].copy()}
     if kind == _TYPES.mjGEOM_PLANE:
         wide, deep = (2 * side if side > 0 else 20.0 for side in (x, y))  # 0 means infinite
-        rgb = _to_bytes(_FLOOR if model.geom_matid[geom] >= 0 else rgba)
+        rgb = to_bytes(_FLOOR if model.geom_matid[geom] >= 0 else rgba)
         scene.add_grid(
             name,
             wide,
@@ -86,7 +86,7 @@ def _add_geom(scene: Any, model: Any, geom: int, rgba: np.ndarray, name: str) ->
             **place,
         )
         return
-    look: dict[str, Any] = {"color": _to_bytes(rgba), "opacity": None if rgba[3] >= 1 else float(rgba[3]), **place}
+    look: dict[str, Any] = {"color": to_bytes(rgba), "opacity": None if rgba[3] >= 1 else float(rgba[3]), **place}
     if kind == _TYPES.mjGEOM_BOX:
         scene.add_box(name, dimensions=(2 * x, 2 * y, 2 * z), **look)
     elif kind == _TYPES.mjGEOM_CYLINDER:
@@ -129,7 +129,8 @@ def _heights(model: Any, number: int) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([x, y, z], -1).reshape(-1, 3).astype(np.float32), faces
 
 
-def _to_bytes(rgba: Any) -> tuple[int, ...]:
+def to_bytes(rgba: Any) -> tuple[int, ...]:
+    """Red, green and blue of a colour, 0 to 255."""
     return tuple(round(255 * float(x)) for x in rgba[:3])
 
 

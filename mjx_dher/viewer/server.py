@@ -13,7 +13,7 @@ from mjx_dher.tools.render import GOAL_RADIUS, GOAL_RGBA
 from mjx_dher.viewer import address
 from mjx_dher.viewer.panel import DRAGGED, Commands, Panel
 from mjx_dher.viewer.player import Game, Player, bounds, make_game
-from mjx_dher.viewer.scene import Poses, add, front
+from mjx_dher.viewer.scene import Poses, add, front, to_bytes
 from mjx_dher.viewer.sources import Cast, Source
 
 _REACHED = (60, 180, 75)  # colour of a reached goal
@@ -43,6 +43,7 @@ class Viewer:
             self._server.gui, controls, list(self._sources), self._commands, self.choose, lambda: self.player, self.take
         )
         self._draw_scene()
+        self._aim()
         self._name()
 
     def __enter__(self) -> Self:
@@ -89,6 +90,7 @@ class Viewer:
         self._panel.adopt()
         if other_scene:
             self._draw_scene()
+            self._aim()
         self._name()
         self.show(True)
 
@@ -110,7 +112,7 @@ class Viewer:
         marks = self.player.marks
         if self._handle is not None and not self._held:
             self._handle.position, self._handle.wxyz = self._place_of(self._taken, marks)
-        colour = _REACHED if self.player.success else _rgb(GOAL_RGBA)
+        colour = _REACHED if self.player.success else to_bytes(GOAL_RGBA)
         balls = iter(self._balls)
         for body, *place in marks:
             mark: Any = next(balls) if body < 0 else self._ghosts.get(body)
@@ -123,7 +125,7 @@ class Viewer:
     def _place_of(self, dragged: str, marks: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
         """Position [3] and orientation [4] of a dragged part. A goal that is only an orientation is at its ghost."""
         game, ghosts = self.player.game, [place for body, *place in marks if body >= 0]
-        pos, quat = self.player.obs["achieved_goal" if dragged == "object" else "desired_goal"][:3], np.array([1.0, 0, 0, 0])
+        pos, quat = self.player.object_position if dragged == "object" else self.player.obs["desired_goal"][:3], np.eye(4)[0]
         if dragged == "goal" and game.turn_goal is not None and ghosts:
             quat = ghosts[0][1]
             pos = pos if game.move_goal else ghosts[0][0]
@@ -146,10 +148,9 @@ class Viewer:
         self._handle = self._add_handle(self._taken) if any(self._moves(self._taken)) else None
         look: dict[str, Any] = {"opacity": GOAL_RGBA[3], "cast_shadow": False, "receive_shadow": False}
         self._balls = [
-            scene.add_icosphere(f"/balls/{i}", GOAL_RADIUS, _rgb(GOAL_RGBA), subdivisions=3, **look)
+            scene.add_icosphere(f"/balls/{i}", GOAL_RADIUS, to_bytes(GOAL_RGBA), subdivisions=3, **look)
             for i in range(sum(body < 0 for body in bodies))
         ]
-        self._aim(env.model)
         self.show(True)
 
     def _moves(self, dragged: str) -> tuple[bool, bool]:
@@ -183,8 +184,8 @@ class Viewer:
         """Follows the handle to a pose, if it still belongs to the part. `phase` is start, update or end."""
         if self._handle is None or dragged != self._taken:
             return
-        self._held = phase != "end"
-        if phase != "update":
+        if phase != "update":  # which a client can send without a start
+            self._held = phase == "start"
             return
         (moves, turns), before = self._moves(dragged), self._place_of(dragged, self.player.marks)
         if turns and abs(before[1] @ place[1]) < 1.0 - 1e-9:  # of unit quaternions
@@ -192,8 +193,9 @@ class Viewer:
         if moves and not np.allclose(before[0], place[0], rtol=0.0, atol=1e-6):
             {"goal": self.player.move_goal, "object": self.player.move_object}[dragged](place[0])
 
-    def _aim(self, model: Any) -> None:
+    def _aim(self) -> None:
         """Moves the cameras to the model's camera "front", if it exists."""
+        model = self.player.game.env.model
         if (camera := front(model, self.player.qpos)) is None:
             return
         (position, forward, angle), center = camera, np.array(model.stat.center)
@@ -223,8 +225,3 @@ def _start(host: str, port: int) -> tuple[Any, dict[str, Callable[[Any], bool]]]
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
     server.scene.configure_environment_map("studio", environment_intensity=0.22)  # light from all sides
     return server, guard.controls
-
-
-def _rgb(rgba: Sequence[float]) -> tuple[int, int, int]:
-    red, green, blue = (round(255 * x) for x in rgba[:3])
-    return red, green, blue

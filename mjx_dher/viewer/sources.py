@@ -47,7 +47,7 @@ def of_run(label: str, folder: Path, env: str | None = None, env_kwargs: Sequenc
         raise ValueError(f"{label} is a policy of {run.env} and cannot be played in {env}, which looks alike")
     load.policy_file(folder)
     arguments = {**(run.env_arguments if env is None else {}), **to_arguments(env_kwargs)}
-    return Source(label, env or run.env, folder, run, to_texts(arguments))
+    return Source(label, env or run.env, folder.absolute(), run, to_texts(arguments))
 
 
 def of_package() -> list[Source]:
@@ -101,13 +101,22 @@ class Cast:
                 result = results.read_result(folder)
                 measured = bundled.facts(folder)["here"] if bundled.is_shipped(folder) else result
                 return (
-                    f"{text}, trained: success {measured['success_rate']:.3f} in {measured['episodes']:,} episodes after"
-                    f" {result['env_steps']:,} steps"
+                    f"{text}, trained{self._where()}: success {measured['success_rate']:.3f} in"
+                    f" {measured['episodes']:,} episodes after {result['env_steps']:,} steps"
                 )
             row: Mapping[str, Any] = results.read_metrics(folder)[-1]
-            return f"{text}, epoch {row['epoch']}: success {row['success_rate']:.2f} after {row['env_steps']:,} steps"
+            news = f"success {row['success_rate']:.2f} after {row['env_steps']:,} steps"
+            return f"{text}, epoch {row['epoch']}{self._where()}: {news}"
         except (FolderError, KeyError, IndexError, OSError, ValueError):  # the policy itself is intact
             return text
+
+    def _where(self) -> str:
+        """Says where a success rate was measured, if not in this environment."""
+        source, run = self.source, self.source.run
+        assert run is not None
+        if source.env != run.env:
+            return f" in `{run.env}`"
+        return "" if source.env_kwargs == to_texts(run.env_arguments) else " with other arguments"
 
     def _stamp(self) -> tuple[int, ...]:
         assert self.source.folder is not None

@@ -141,7 +141,7 @@ def checked(file: Path, problem: str = "is damaged") -> Iterator[None]:
         raise
     except KeyError as error:
         raise FolderError(f"{file} {problem} ({error} is missing)") from error
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         raise FolderError(f"{file} {problem} ({error})") from error
 
 
