@@ -90,6 +90,8 @@ class BraxEnv:
 
     def _state(self, inner: Any, goal: Array, failed: Array) -> BraxState:
         achieved, goal = (jnp.asarray(x, jnp.float32) for x in (self._achieved(inner), goal))
+        if not achieved.ndim == goal.ndim == 1:
+            raise ValueError(f"from_brax: achieved and goal must return vectors [G]; got {achieved.shape} and {goal.shape}")
         observation = jax.tree.map(_plain, self._observe(inner))
         obs = GoalObs(observation=observation, achieved_goal=achieved, desired_goal=goal)
         reward = self.compute_reward(achieved, goal)

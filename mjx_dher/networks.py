@@ -219,9 +219,11 @@ def residual(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike =
 
 
 def unit_norm(action_size: int, hidden_sizes: tuple[int, ...], dtype: DTypeLike = "float32", heads: Heads = PLAIN) -> Networks:
-    """`residual` with the weights of each hidden unit projected to length 1 after each update, as in XQC and SimbaV2 (2025).
+    """`residual` with the weights of each hidden unit projected to length 1, at first and after each update, as in XQC and
+    SimbaV2 (2025).
 
-    Layer normalization makes the outputs independent of these lengths. Kept at 1, they do not grow and shorten the steps.
+    Layer normalization makes the outputs independent of a factor common to the units of a layer. Kept at length 1, the weights
+    do not grow and shorten the steps.
     """
     return residual(action_size, hidden_sizes, dtype, heads)._replace(project=_to_unit_length)
 

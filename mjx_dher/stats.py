@@ -61,12 +61,12 @@ def curve_interval(
       Three arrays [P]: the mean, and the lower and upper ends of the interval.
 
     Raises:
-      ValueError: `curves` is not [S, P], `level` does not lie between 0 and 1, or `repeats` is less than 1.
+      ValueError: `curves` is not [S, P] or has a NaN, `level` does not lie between 0 and 1, or `repeats` is less than 1.
     """
     from scipy.stats import trim_mean
 
     curves = np.asarray(curves, float)
-    _curves(np.arange(curves.shape[-1]) if curves.ndim else (), curves)
+    _scores(_curves(np.arange(curves.shape[-1]) if curves.ndim else (), curves)[1])
     chosen = _generator(seed, repeats).integers(len(curves), size=(repeats, len(curves)))
     low, high = _quantiles(trim_mean(curves[chosen], 0.25, axis=1), level)
     return trim_mean(curves, 0.25, axis=0), low, high

@@ -119,7 +119,7 @@ def _field_problems(settings: Config | HParams) -> Iterator[str]:
                 yield from filter(None, (_number_problem(name, size, number, int) for size in value))
         elif hasattr(value, "at") or getattr(value, "ndim", None):  # of JAX, perhaps traced, or one number for each run
             continue
-        elif problem := _number_problem(name, plain(value), number, hints[name]):
+        elif problem := _number_problem(name, value, number, hints[name]):
             yield problem
     for name, hint in hints.items():
         if get_origin(hint) is Literal:
@@ -130,7 +130,7 @@ def _field_problems(settings: Config | HParams) -> Iterator[str]:
 
 
 def _number_problem(field: str, value: Any, number: Number, kind: type) -> str | None:
-    allowed = (int,) if kind is int else (int, float)
+    value, allowed = value if hasattr(value, "at") else plain(value), (int,) if kind is int else (int, float)
     if isinstance(value, bool) or not isinstance(value, allowed):
         what = "an integer" if kind is int else "a number"
         return f"{field} must be {what} in {number.interval}; got {value!r}"

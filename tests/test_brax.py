@@ -120,6 +120,8 @@ def test_bad_arguments_are_refused():
     for options, names in (({"threshold": 0.0}, "threshold"), ({"episode_length": 1.5}, "episode_length")):
         with refuses(names, str(options[names])):
             make(**options)
+    with refuses("achieved and goal must return vectors [G]", "()"):
+        from_brax(Line(), lambda s: s.obs[0], lambda s: s.obs[1], 0.1, 5).reset(jax.random.key(0))
     with refuses("(2,)", "(1,)"):
         make().step(make().reset(jax.random.key(0)), jnp.zeros(2))
 

@@ -41,8 +41,8 @@ def test_episodes_of_a_loop_of_one_s_own(capsys):
     own_episodes.main()
     assert capsys.readouterr().out.startswith("16 episodes; a batch of 64, mean reward -")
     ours = own_episodes.play(jax.random.key(0))
-    key, env = jax.random.key(0), own_episodes.env
-    actions = jax.random.uniform(key, (env.episode_length, 16, 2), minval=-1, maxval=1)
+    (key, action_key), env = jax.random.split(jax.random.key(0)), own_episodes.env
+    actions = jax.random.uniform(action_key, (env.episode_length, 16, 2), minval=-1, maxval=1)
     theirs, _ = jax.jit(lambda key, actions: rollout(env, lambda action, obs: action, key, 16, actions))(key, actions)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_array_equal(a, b)

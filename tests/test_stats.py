@@ -221,6 +221,8 @@ def test_curve_interval_is_the_interval_of_each_point():
         assert (low[point], high[point]) == pytest.approx(want, abs=0.04 * (want[1] - want[0]))
     with refuses("curves", "[S, P]"):
         stats.curve_interval(curves[0])
+    with refuses("scores must be numbers", "nan"):
+        stats.curve_interval(np.where(curves == curves.max(), np.nan, curves))
     with refuses("level", 1.0):
         stats.curve_interval(curves, level=1.0)
     with refuses("repeats", 0):

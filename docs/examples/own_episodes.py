@@ -16,8 +16,9 @@ env = PointMass()
 
 def play(key: jax.Array) -> Episode:
     """Plays 16 episodes of random actions in a custom scan."""
-    first = jax.vmap(env.reset)(jax.random.split(key, 16))
-    actions = jax.random.uniform(key, (env.episode_length, 16, env.action_size), jnp.float32, minval=-1, maxval=1)
+    reset_key, action_key = jax.random.split(key)
+    first = jax.vmap(env.reset)(jax.random.split(reset_key, 16))
+    actions = jax.random.uniform(action_key, (env.episode_length, 16, env.action_size), jnp.float32, minval=-1, maxval=1)
     last, obs = jax.lax.scan(lambda state, action: (jax.vmap(env.step)(state, action), state.obs), first, actions)
     whole = jax.tree.map(lambda steps, end: jnp.moveaxis(jnp.concatenate([steps, end[None]]), 0, 1), obs, last.obs)
     observation, achieved_goal = whole["observation"], whole["achieved_goal"]

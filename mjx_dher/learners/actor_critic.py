@@ -41,6 +41,13 @@ class ActorCriticState:
     num_updates: Array  # [] int32
 
 
+def _key_data(key: PRNGKey) -> Array:
+    """Data of a learner's key, in JAX's default implementation, with which updates wrap it."""
+    if jax.random.key_impl(key) != jax.random.key_impl(jax.random.key(0)):
+        key = jax.random.key(jax.random.bits(key))
+    return jax.random.key_data(key)
+
+
 def first_state(learner: ActorCriticBase, key: PRNGKey, init_critic: Callable[..., PyTree]) -> ActorCriticState:
     """State with fresh networks, equal targets and empty normalizers.
 
@@ -50,15 +57,15 @@ def first_state(learner: ActorCriticBase, key: PRNGKey, init_critic: Callable[..
     actor_key, critic_key, update_key = jax.random.split(key, 3)
     observation, goal, action = zeros(learner.spec, learner.networks)
     params = Params(
-        actor=learner.actor.init(learner.networks.actor, actor_key, observation, goal),
-        critic=init_critic(critic_key, observation, goal, action),
+        actor=learner.project(learner.actor.init(learner.networks.actor, actor_key, observation, goal)),
+        critic=learner.project(init_critic(critic_key, observation, goal, action)),
     )
     return ActorCriticState(
         params=params,
         target=jax.tree.map(jnp.copy, learner.lagging(params)),
         actor_moments=common.adam(0.0).init(params.actor),
         critic_moments=common.adam(0.0).init(params.critic),
-        key=jax.random.key_data(update_key),
+        key=_key_data(update_key),
         num_updates=jnp.zeros((), jnp.int32),
         **learner.normalizers(),
     )

@@ -21,6 +21,7 @@ from mjx_dher.types import Array, Batch, EnvSpec, GoalObs, Metrics, PRNGKey, PyT
 
 State = TypeVar("State", bound=Any)  # has params, target, observation_norm and goal_norm
 Tree = TypeVar("Tree", bound=Any)
+_RESET = 2**32 - 1  # folded into the key of new networks, because updates fold their number into the same key
 
 
 @struct.dataclass
@@ -76,7 +77,8 @@ class ActorCriticBase(Learner):
 
     def _reset(self, state: State) -> State:
         """State with new networks and Adam moments once every `reset_every` updates (Nikishin et al. 2022)."""
-        fresh = self.init(jax.random.fold_in(jax.random.wrap_key_data(state.key), state.num_updates))
+        key = jax.random.fold_in(jax.random.wrap_key_data(state.key), _RESET)
+        fresh = self.init(jax.random.fold_in(key, state.num_updates))
         kept = {name: getattr(state, name) for name in ("observation_norm", "goal_norm", "key", "num_updates")}
         due = (state.num_updates > 0) & (state.num_updates % self.reset_every == 0)
         return jax.tree.map(lambda new, old: jnp.where(due, new, old), dataclasses.replace(fresh, **kept), state)

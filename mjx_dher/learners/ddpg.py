@@ -68,8 +68,8 @@ class DDPG(ActorCriticBase):
         actor_key, critic_key = jax.random.split(key)
         observation, goal, action = zeros(self.spec, self.networks)
         params = Params(
-            actor=self.networks.actor.init(actor_key, observation, goal),
-            critic=self.networks.critic.init(critic_key, observation, goal, action),
+            actor=self.project(self.networks.actor.init(actor_key, observation, goal)),
+            critic=self.project(self.networks.critic.init(critic_key, observation, goal, action)),
         )
         return DDPGState(
             params=params,

@@ -100,7 +100,8 @@ def _check_log_weights(values: NDArray, alone: NDArray, played: NDArray) -> str:
     num_steps = values.shape[1]
     past = np.tril(np.ones((num_steps, num_steps + 1), bool))
     missing = f"no goal at {1 - offers.mean():.0%} of the steps, which keep their own; " if not offers.all() else ""
-    return f"sampler as it should be: {missing}goals of the past {'too' if (weights[:, past] > 0).any() else 'never'}"
+    taken = ((weights > 0) & past & played[..., None]).any()
+    return f"sampler as it should be: {missing}goals of the past {'too' if taken else 'never'}"
 
 
 def _weights(log_weights: NDArray) -> NDArray:
