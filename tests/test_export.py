@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import os
 import re
 import subprocess
 import sys
@@ -320,7 +321,7 @@ def test_a_run_without_a_policy_is_refused(tmp_path, capsys):
 
 def test_a_folder_that_cannot_be_written_to_is_told(run, tmp_path):
     """A folder is where the unfinished file would be."""
-    (tmp_path / "policy.onnx.partial").mkdir()
+    (tmp_path / f"policy.onnx.{os.getpid()}.partial").mkdir()
     policy, started = mjx_dher.load_policy(run), reading.read_spec(run)
     with refuses("out", tmp_path / "policy.onnx"):
         export.write(policy, started, "onnx", tmp_path / "policy.onnx")

@@ -47,7 +47,7 @@ def test_folders_that_cannot_be_flushed_are_passed_over_and_files_are_not(number
         files.write_json(tmp_path / "y.json", {})
     assert (raised.value.errno, str(tmp_path / "y.json")) == (
         number,
-        sentence(raised.value).split(": ")[0].removesuffix(".partial"),
+        sentence(raised.value).split(": ")[0].removesuffix(f".{os.getpid()}.partial"),
     )
     assert not list(tmp_path.glob("y.json*"))
 
@@ -185,3 +185,26 @@ def test_a_file_system_that_tells_no_size_is_not_full(size, tmp_path, monkeypatc
     nothing = SimpleNamespace(f_frsize=size, f_blocks=0, f_bavail=0, f_files=0, f_favail=0)
     monkeypatch.setattr(os, "statvfs", lambda path: nothing)
     assert files.lack_of_space(tmp_path / "a", [10**9]) is None
+
+
+def test_two_programs_write_one_file(tmp_path):
+    """Each write is whole, and neither program takes the other's unfinished file for a leftover."""
+    code = "import sys; from pathlib import Path; from mjx_dher.system import files\n"
+    code += "for _ in range(300): files.write(Path(sys.argv[1]), sys.argv[2].encode() * 999)"
+    command = [sys.executable, "-c", code, str(tmp_path / "x")]
+    both = [subprocess.Popen([*command, letter], cwd=ROOT) for letter in "ab"]
+    assert [process.wait() for process in both] == [0, 0]
+    assert (tmp_path / "x").read_bytes() in (b"a" * 999, b"b" * 999)
+    assert os.listdir(tmp_path) == ["x"]
+
+
+def test_what_a_killed_program_has_left_goes_with_the_next_write(tmp_path):
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        pass
+    kept = ("x.mine.partial", f"xy.{ended.pid}.partial", f"x.{os.getppid()}.partial")
+    for name in (*kept, f"x.{ended.pid}.partial", f"x.{os.getpid()}.partial"):
+        (tmp_path / name).write_text("")
+    files.write(tmp_path / "x", b"new")
+    assert sorted(os.listdir(tmp_path)) == sorted(("x", *kept))
+    with pytest.raises(OSError, match="nowhere"):
+        files.write(tmp_path / "nowhere" / "x", b"")

@@ -5,6 +5,7 @@ import dataclasses
 import itertools
 import json
 import math
+import os
 import shutil
 
 import numpy as np
@@ -290,8 +291,8 @@ def test_links_in_the_way_are_removed_and_not_followed(stopped, tmp_path):
     (elsewhere / "file").write_text("mine")
     (stopped / "checkpoints" / "epoch-000001").symlink_to(elsewhere)
     (stopped / "checkpoints" / ".partial-000009").symlink_to(elsewhere)
-    (stopped / "policy.npz.partial").symlink_to(elsewhere / "file")
-    (stopped / "metrics.csv.partial").symlink_to(elsewhere / "file")
+    (stopped / f"policy.npz.{os.getpid()}.partial").symlink_to(elsewhere / "file")
+    (stopped / f"metrics.csv.{os.getpid()}.partial").symlink_to(elsewhere / "file")
     train(stopped, until=5)
     assert [path.name for path in run_folder.checkpoints(stopped)] == ["epoch-000005", "epoch-000004"]
     assert (elsewhere / "file").read_text() == "mine"
@@ -317,8 +318,9 @@ def test_what_must_survive_a_power_cut_is_flushed_before_what_relies_on_it(tmp_p
     assert partial[-1] == "run/checkpoints/.partial-000004"  # the folder itself, after what is in it
     assert {name.rpartition("/")[2] for name in partial} >= {"manifest.json", "state"}
     assert end > first
-    assert last("run/policy.npz") < last("run/result.json.partial")
-    assert last("run/metrics.csv") < last("run/result.json.partial")
+    result = last(f"run/result.json.{os.getpid()}.partial")
+    assert last("run/policy.npz") < result
+    assert last("run/metrics.csv") < result
     assert flushed[-1] == "run"
 
 

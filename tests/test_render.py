@@ -188,7 +188,7 @@ def test_names_that_ffmpeg_would_read_otherwise_are_names(tmp_path, monkeypatch,
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pic1.png.partial").write_text("mine")
     render.write_frames(Path(name), moving(1), 25.0)
-    assert sorted(os.listdir(tmp_path)) == sorted([name, "pic1.png.partial"])
+    assert sorted(os.listdir(tmp_path)) == sorted([name, "pic1.png.partial"])  # the user's
     assert (tmp_path / "pic1.png.partial").read_text() == "mine"
 
 

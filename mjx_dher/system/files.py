@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 LARGEST_JSON = 8 << 20  # bytes
 LONGEST_LINE = 100_000  # bytes; the module csv reads fields of 131,072
-PARTIAL = ".partial"  # suffix of a file that is being written; an older one is deleted first
+PARTIAL = ".partial"  # suffix of a file that is being written, after its name and the number of the process
 LOCK = ".lock"  # name of a folder's lock file
 _MARKER = f"{LOCK}.soft"  # name on a file system without locks
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)  # filelock itself marks the folder for ENOSYS
@@ -258,12 +258,24 @@ def _without_nan(content: Any) -> Any:
 
 @contextlib.contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Yields a path to write to, which replaces `path` when the block ends.
+    """Yields a path to write to, which replaces `path` when the block ends. Of two programs, the last one to end wins.
 
-    After an error, `path` is unchanged and the new file is deleted.
+    After an error, `path` is unchanged and the new file is deleted. So are those that killed processes have left.
     """
-    partial = path.with_name(path.name + PARTIAL)
-    partial.unlink(missing_ok=True)  # left by a killed process, or a link to another file
+    partial = path.with_name(f"{path.name}.{os.getpid()}{PARTIAL}")
     with signals.cleaning(lambda: partial.unlink(missing_ok=True)), naming(path):
+        for left in path.parent.iterdir():
+            pid = left.name.removeprefix(f"{path.name}.").removesuffix(PARTIAL)
+            if left.name == f"{path.name}.{pid}{PARTIAL}" and pid.isdecimal() and (left == partial or not _runs(int(pid))):
+                left.unlink(missing_ok=True)
         yield partial
         partial.replace(path)
+
+
+def _runs(pid: int) -> bool:
+    with contextlib.suppress(PermissionError, OverflowError):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return False
+    return True

@@ -49,9 +49,9 @@ def make_game(env: Any) -> Game:
     """
     check_drawable(env)
     goal = jax.eval_shape(env.reset, jax.random.key(0)).obs["desired_goal"].shape
-    is_point, is_placed = goal == (3,), hasattr(env, "object_position") or goal in ((3,), (7,))
-    has_object = getattr(env, "has_object", is_placed)  # all built-in tasks share their methods, even without an object
-    has_position = bounds(env, "goal") is not None if hasattr(env, "goal_bounds") else is_point
+    is_placed = hasattr(env, "object_position") or goal in ((3,), (7,))
+    has_object = is_placed and getattr(env, "has_object", True)  # built-in tasks have the methods also without an object
+    has_position = bounds(env, "goal") is not None if hasattr(env, "goal_bounds") else goal == (3,)
 
     def move_goal(state: Any, position: Any) -> Any:  # a pose keeps its orientation
         return env.with_goal(state, jnp.concatenate([position, state.obs["desired_goal"][3:]]))

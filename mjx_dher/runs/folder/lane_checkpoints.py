@@ -51,7 +51,7 @@ class LaneCheckpoints:
 
     def _sources(self) -> dict[Path, list[int]]:
         """Folders with checkpoints of at least these runs, the latest first, and the places of the runs in them."""
-        held = {self.folder: self.names} | _held(self.shared, self.folders)
+        held = {self.folder: self.names} | _held(self.shared, self.folders if len(self.folders) == 1 else ())
         having = [folder for folder, names in held.items() if {*names} >= {*self.names} and _newest(folder)]
         return {folder: [*map(held[folder].index, self.names)] for folder in sorted(having, key=_newest, reverse=True)}
 
