@@ -1,4 +1,4 @@
-"""Intervals of success rates. Loads no other module, because every run ends here."""
+"""Intervals of success rates. Loads only `math`, because every run uses it at its end."""
 
 import math
 

@@ -130,7 +130,8 @@ def _field_problems(settings: Config | HParams) -> Iterator[str]:
 
 
 def _number_problem(field: str, value: Any, number: Number, kind: type) -> str | None:
-    value, allowed = value if hasattr(value, "at") else plain(value), (int,) if kind is int else (int, float)
+    value = value if hasattr(value, "at") else plain(value)  # JAX's can be traced
+    allowed = (int,) if kind is int else (int, float)
     if isinstance(value, bool) or not isinstance(value, allowed):
         what = "an integer" if kind is int else "a number"
         return f"{field} must be {what} in {number.interval}; got {value!r}"

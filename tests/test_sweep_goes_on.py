@@ -102,6 +102,14 @@ def test_each_run_resumes_from_its_latest_checkpoint(tmp_path, whole):
     goes_on(tmp_path, whole, [*pair, *((1, epoch) for epoch in range(2, 6)), (3, 5)], range(4), lanes=3)
 
 
+def test_runs_that_share_a_checkpoint_need_no_list_of_names(tmp_path, whole):
+    """The list is damaged, and the runs are claimed in the same order."""
+    cut_short(tmp_path, make_grid(("future",), (0, 1, 2), static=LONGER), 3, lanes=3)
+    (cells,) = tmp_path.glob("unfinished/*/cells.json")
+    cells.write_text("{")
+    goes_on(tmp_path, whole, [(0, 1, 2, epoch) for epoch in (4, 5)], range(3), lanes=3)
+
+
 def test_a_failed_lane_is_no_other_one_s_failure(tmp_path):
     """The second of three fails in the first epoch. After the stop they go on one by one."""
     bad = HParams(action_l2=3e38)

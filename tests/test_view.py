@@ -136,6 +136,8 @@ def test_a_policy_that_cannot_be_played_is_told_and_the_other_goes_on(port):
         assert viewer.player is before
         assert "push cannot be played in reach" in viewer._panel._about.content
         assert viewer._panel._policy.value == "reach"
+        viewer._panel.say("runs/x\udcff")  # bytes of a file name, which no message can hold
+        assert viewer._panel._about.content == "runs/x\\xff"
 
 
 def test_a_hand_moves_the_goal(port):

@@ -261,7 +261,7 @@ def train(
 
 
 def _deliver(folder: Path, chunk: Chunk, parcels: Sequence[bytes], report: Callable[[str], None]) -> int:
-    """Writes the ended runs of a chunk, and removes its checkpoints if all have ended. Returns how many had not before."""
+    """Writes the ended runs of a chunk, and removes its checkpoints if all have ended. Returns the number of new ones."""
     ended = new = 0
     for spec, parcel in zip(chunk.specs, parcels):
         place = grid.folder_of(folder, spec)

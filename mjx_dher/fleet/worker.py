@@ -138,9 +138,10 @@ def pack(folder: Path) -> bytes:
 
 
 def unpack(folder: Path, spec: RunSpec, parcel: bytes) -> bool:
-    """Writes an ended trial into its folder, result.json last, so that the run is complete or not ended. Returns whether it
-    did: an ended run that is already there stays unchanged. Raises FolderError if another process uses the folder, it is not
-    writable, or the bytes are not this complete trial.
+    """Writes an ended trial into its folder, result.json last, so that the run is complete or not ended.
+
+    An ended run that is already there stays unchanged, and the result is False. Raises FolderError if another process uses the
+    folder, it is not writable, or the bytes are not this complete trial.
     """
     try:
         files.make_folder(folder)

@@ -273,9 +273,10 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def _runs(pid: int) -> bool:
-    with contextlib.suppress(PermissionError, OverflowError):
-        try:
-            os.kill(pid, 0)
-        except ProcessLookupError:
-            return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):  # another user's; no process has such a number
+        return True
     return True

@@ -9,13 +9,13 @@ import textwrap
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from mjx_dher import lookup
 from mjx_dher.system import files
 
 # Okabe and Ito's palette for colour-blind readers, from dark to light, each colour with its own line and marker.
-_STYLES = (
+_STYLES: tuple[tuple[str, Any, str], ...] = (
     ("#000000", "-", "o"),
     ("#0072B2", "--", "s"),
     ("#D55E00", "-.", "^"),
@@ -50,8 +50,12 @@ def preload() -> None:
 
 def styles(number: int) -> list[tuple[Any, Any, str]]:
     """Colour, line and marker of each of `number` curves. The first 49 differ in colour or line."""
-    one = lambda i, part: cast("Any", _STYLES[i % len(_STYLES)][part])  # noqa: E731
-    return [(one(i, 0), one(i + (rounds := i // len(_STYLES)), 1), one(i + 2 * rounds, 2)) for i in range(number)]
+    chosen = []
+    for i in range(number):
+        rounds = i // len(_STYLES)  # lines are shifted by one in each round of colours, and markers by two
+        colour, line, marker = (_STYLES[(i + shift * rounds) % len(_STYLES)] for shift in (0, 1, 2))
+        chosen.append((colour[0], line[1], marker[2]))
+    return chosen
 
 
 def subplots(rows: int, columns: int, width: float, height: float, **options: Any) -> tuple[Any, list[Any]]:

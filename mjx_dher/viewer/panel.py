@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_dher import lookup
 from mjx_dher.system import private_api
 from mjx_dher.viewer.player import Player
 
@@ -107,11 +108,12 @@ class Panel:
         """Shows the current policy and its origin."""
         if self._policy.value != label:
             self._policy.value = label
-        self._about.content, self._critic.content, self._value.visible = about, critic, has_value
+        self.say(about)
+        self._critic.content, self._value.visible = lookup.escaped(critic), has_value
 
     def say(self, text: str) -> None:
         """Shows a sentence in place of the policy's origin."""
-        self._about.content = text
+        self._about.content = lookup.escaped(text)
 
     def update(self, with_curves: bool) -> None:
         player = self._player()

@@ -51,9 +51,9 @@ class LaneCheckpoints:
 
     def _sources(self) -> dict[Path, list[int]]:
         """Folders with checkpoints of at least these runs, the latest first, and the places of the runs in them."""
-        held = {self.folder: self.names} | _held(self.shared, self.folders if len(self.folders) == 1 else ())
-        having = [folder for folder, names in held.items() if {*names} >= {*self.names} and _newest(folder)]
-        return {folder: [*map(held[folder].index, self.names)] for folder in sorted(having, key=_newest, reverse=True)}
+        own = [self.folder, *(self.folders if len(self.folders) == 1 else ())]
+        held = reversed(_held(self.shared, dict.fromkeys(own, self.names)).items())
+        return {folder: [*map(names.index, self.names)] for folder, names in held if {*names} >= {*self.names}}
 
     def restore(self, init: Callable[[], TrainState], will_save: bool) -> Start:
         """Restores the newest checkpoint. Without one, the runs start with the state from `init`. Raises FolderError if no
@@ -195,19 +195,16 @@ def remove_ended(storage: Path, names_file: str, cells: Path) -> None:
 
 def groups(shared: Path, folders: Sequence[Path]) -> dict[str, str]:
     """The folder of the latest checkpoint of each run in `folders` that has one. Runs with the same one resume together."""
-    held, own = _held(shared, folders), {folder.name for folder in folders}
-    return {name: str(folder) for folder in sorted(held, key=_newest) for name in held[folder] if name in own}
+    own = {folder.name for folder in folders}
+    held = _held(shared, {folder: [folder.name] for folder in folders})
+    return {name: str(folder) for folder, names in held.items() for name in names if name in own}
 
 
-def _held(shared: Path, folders: Sequence[Path]) -> dict[Path, list[str]]:
-    """Names of the runs of each folder with a checkpoint: shared ones, and the runs' own."""
-    held = {path.parent: _names(path) for path in sorted(shared.glob(f"*/{NAMES_FILE}"))}
-    return {folder: names for folder, names in (held | {own: [own.name] for own in folders}).items() if _newest(folder)}
-
-
-def _newest(folder: Path) -> int:
-    """Epoch of the newest checkpoint, or 0."""
-    return max(map(run_folder.epoch_of, run_folder.checkpoints(folder)), default=0)
+def _held(shared: Path, own: dict[Path, list[str]]) -> dict[Path, list[str]]:
+    """Names of the runs of each folder with a checkpoint, in `shared` and among `own`, the latest checkpoint last."""
+    held = {path.parent: _names(path) for path in sorted(shared.glob(f"*/{NAMES_FILE}"))} | own
+    saved = {folder: paths[0] for folder in held if (paths := run_folder.checkpoints(folder))}
+    return {folder: held[folder] for folder in sorted(saved, key=lambda folder: run_folder.epoch_of(saved[folder]))}
 
 
 def _names(path: Path) -> list[str]:

@@ -54,22 +54,25 @@ def restore(folder: Path, template: Any, lines: Sequence[int] = (), places: Sequ
                 own = places or range(len(runs)) or (0,)
                 if places and max(places) >= len(runs):
                     raise CheckpointError(f"{path} has {len(runs)} runs, and not number {1 + max(places)}")
-                ended = {int(place): failure for place, failure in manifest["failed"].items()}
-                failed = {lane: ended[place] for lane, place in enumerate(own) if place in ended}
-                _check_lines(path, manifest["epoch"], failed, lines)
+                failed = _check_lines(path, manifest, lines, own)
                 arrays = _load(path, manifest, template, own)
-            state, runs = _place(arrays, template), [runs[place] for place in own] if runs else []
+            state, runs = _place(arrays, template), [runs[place] for place in own if runs]
             return Restored(path, manifest["epoch"], manifest["wall_seconds"], state, runs, refused, failed)
         except FolderError as error:
             refused[path] = str(error)
     raise CheckpointError(f"{folder} has no checkpoint to resume from: " + "\n".join(refused.values()))
 
 
-def _check_lines(path: Path, epoch: int, failed: Mapping[int, Sequence[Any]], lines: Sequence[int]) -> None:
-    """Raises CheckpointError if a run's metrics.csv lacks epochs that had ended."""
+def _check_lines(
+    path: Path, manifest: Mapping[str, Any], lines: Sequence[int], places: Sequence[int]
+) -> dict[int, tuple[int, str]]:
+    """Failed runs of those at `places`. Raises CheckpointError if a run's metrics.csv lacks epochs that had ended."""
+    ended = {int(place): (epoch, reason) for place, (epoch, reason) in manifest["failed"].items()}
+    failed = {lane: ended[place] for lane, place in enumerate(places) if place in ended}
     for lane, whole in enumerate(lines):
-        if whole < (failed[lane][0] - 1 if lane in failed else epoch):  # the epoch that failed has no line
+        if whole < (failed[lane][0] - 1 if lane in failed else manifest["epoch"]):  # the epoch that failed has no line
             raise CheckpointError(f"{path} has a later epoch than the last complete line of metrics.csv, {whole}")
+    return failed
 
 
 def _load(path: Path, manifest: Mapping[str, Any], template: Any, places: Sequence[int]) -> list[np.ndarray]:
